@@ -1,6 +1,6 @@
-//! How late this machine wakes a loop, and whether that suits a rig.
+//! Latency test: how late this machine wakes a loop, and whether that suits a rig.
 //!
-//! In: a period and a number of cycles. Out: histograms and counts, and a verdict from them. The loop is that of a rig
+//! In: a period and a number of cycles. Out: histograms and counts, and an assessment. The loop is that of a rig
 //! without its model: SYNC, a drive's answer, a set-point, on a simulated bus in real time.
 
 use crate::can::sim::{Actor, Port, Simulation};
@@ -9,50 +9,50 @@ use crate::realtime::clock::Clock;
 use crate::realtime::histogram::Histogram;
 use crate::realtime::threads::{self, Refusal, Wishes};
 
-/// What a run has shown.
+/// Results of a run.
 pub struct Report {
-    /// Nanoseconds of a cycle.
+    /// Period of a cycle, ns.
     pub period_ns: u64,
-    /// How many were run.
+    /// Number of cycles.
     pub cycles: u64,
-    /// From when a cycle was due to when it began.
+    /// Delay of the start of each cycle after its tick.
     pub lateness: Histogram,
-    /// Time to read what had come.
+    /// Time to read received frames.
     pub receive: Histogram,
-    /// Time to hand over SYNC and set-point.
+    /// Time to send SYNC and set-point.
     pub transmit: Histogram,
-    /// From SYNC to its answer.
+    /// Time from SYNC to its answer.
     pub answer: Histogram,
     /// Cycles without an answer by 0.45 of their period.
     pub missed: u64,
-    /// Cycles that were not over at the next one's begin.
+    /// Cycles that lasted into the next one.
     pub overruns: u64,
-    /// Pages mapped or fetched meanwhile.
+    /// Page faults during the run.
     pub page_faults: u64,
-    /// What the machine refused.
+    /// Wishes that the system refused.
     pub refused: Vec<Refusal>,
 }
 
-/// What it means.
+/// Assessment of a machine.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Fit {
     /// Lateness below a twentieth of the period.
     Fit,
-    /// Below a fifth: for drives whose commands act with the next SYNC, which are deaf to it.
+    /// Lateness below a fifth: suits drives whose commands act on the next SYNC, because it does not affect them.
     AtSync,
     /// Neither.
     NotForTorque,
 }
 
 impl Report {
-    /// What it means.
+    /// The assessment of this run.
     pub fn fit(&self) -> Fit {
         if self.overruns > 0 { Fit::NotForTorque } else { Fit::of(self.lateness.max_ns(), self.period_ns) }
     }
 }
 
 impl Fit {
-    /// That of a loop without overruns whose cycles began so late at most.
+    /// The assessment of a loop without overruns, by its greatest lateness.
     pub fn of(late_ns_max: u64, period_ns: u64) -> Fit {
         match late_ns_max {
             late if late < period_ns / 20 => Fit::Fit,
@@ -62,7 +62,7 @@ impl Fit {
     }
 }
 
-/// Runs the loop, until `stop` says so at the latest.
+/// Runs the loop for the given number of cycles, or until `stop` returns true.
 pub fn run(period_ns: u64, cycles: u64, wishes: &Wishes, stop: impl Fn() -> bool) -> Report {
     let world = Simulation::real_time();
     let clock = world.monotonic().expect("this world's time is real");
@@ -111,7 +111,7 @@ pub fn run(period_ns: u64, cycles: u64, wishes: &Wishes, stop: impl Fn() -> bool
         transmit_ns += end_ns - answer_ns;
         report.transmit.count(transmit_ns);
         report.cycles += 1;
-        // The phase stays: whole periods are left out.
+        // The phase is kept: whole periods are skipped.
         let late = end_ns.saturating_sub(due_ns) / period_ns;
         report.overruns += u64::from(late > 0);
         k += 1 + late;
@@ -157,7 +157,7 @@ mod tests {
 
     #[test]
     fn the_loop_counts_its_cycles() {
-        // No word on times: another machine is busy with other things.
+        // Times are not checked, because the test machine may be busy.
         let report = run(2_000_000, 20, &Wishes { memory: false, awake: false, ..Wishes::default() }, || false);
         assert_eq!((report.cycles, report.lateness.total(), report.transmit.total()), (20, 20, 20));
         assert_eq!(report.answer.total() + report.missed, 20);

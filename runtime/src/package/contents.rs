@@ -1,8 +1,7 @@
-//! What is in a package of a rig, read and judged as a whole: its two programs, its plan, the head of its logs.
+//! Contents of a rig's package, decoded and checked as a whole: its programs, its plan, the head of its logs.
 //!
-//! In: a [`Package`]. Out: its [`Contents`], each part sound by itself and all of them fitting each other, or the first
-//! thing that does not. `check`, `inspect`, `install` and `run` all go through here, so that what one of them accepts is
-//! what the others show and run.
+//! In: a [`Package`]. Out: its [`Contents`], with each part valid and all parts consistent, or the first error.
+//! `check`, `inspect`, `install` and `run` all use this, so that they accept, show and run the same.
 
 use super::{Package, Refusal};
 use crate::record::log::Sections;
@@ -12,31 +11,32 @@ use abi::live::Live;
 use abi::rig::Rig;
 use abi::table::Function;
 
-/// What every program of a rig must have: it is started, stepped, and its outputs are read.
+/// Functions that every program of a rig must have: it is started and stepped, and its outputs are read.
 const NEEDED: [Function; 3] = [Function::Start, Function::Outputs, Function::Step];
 
-/// A package, taken apart.
+/// The decoded parts of a package.
 #[derive(Debug)]
 pub struct Contents {
-    /// The system with one part crossed out.
+    /// The system without the part that hardware replaces.
     pub control: Image,
-    /// The crossed-out part.
+    /// The part that hardware replaces.
     pub plant: Image,
-    /// What judges sets of parameters while it runs.
+    /// The program that computes the conditions on parameters at run time.
     pub judge: Image,
-    /// Which parameters may change then, and the conditions that the judge computes.
+    /// Parameters that may change at run time, and their conditions.
     pub live: Live,
-    /// What joins them.
+    /// The rig that connects them.
     pub rig: Rig,
-    /// The head of every log of it: names and texts.
+    /// Head of all logs: names and texts.
     pub head: Sections,
 }
 
 impl Package {
-    /// Takes a package apart.
+    /// Decodes a package.
     ///
     /// # Errors
-    /// What in it is missing, makes no sense or does not fit the rest. Whether this computer can run it is not asked.
+    /// A part that is missing, invalid or inconsistent with the others. Does not check whether this computer can run
+    /// it.
     pub fn contents(&self) -> Result<Contents, Refusal> {
         let program = |name: &str, needed: &[Function]| -> Result<Image, Refusal> {
             let image = Image::read(self.section(name)?);

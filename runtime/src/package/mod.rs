@@ -1,18 +1,18 @@
-//! A rig packed for the computer that runs it: one file that is whole or refused.
+//! A rig packed for the computer that runs it: one file that is intact or refused.
 //!
-//! In: named sections of bytes (compiled programs, the rig's plan, sources) and what they were made with. Out: the
-//! bytes of a file, or from a file its sections, once every bit of it has been accounted for. Equal content gives equal
-//! bytes. Knows nothing of what the sections mean.
+//! In: named sections of bytes (compiled programs, the rig's plan, sources) and their origin. Out: the bytes of a file;
+//! or the sections of a file, once every bit of it has been verified. Equal content results in equal bytes. Does not
+//! know the meaning of the sections.
 //!
 //! ```text
 //!    0  "FRICPKG\n"
-//!    8  version          u32       12  number of sections  u32      16  length of all  u64
-//!   24  SHA-256 of everything, these 32 bytes taken as zeros
+//!    8  version          u32       12  number of sections  u32      16  total length  u64
+//!   24  SHA-256 of everything, with these 32 bytes as zeros
 //!   56  manifest: fric version, target, rig (text: u32 length and bytes); then for each section
 //!       its name (text), offset and length (u64), SHA-256
-//!       sections one behind the other, in the order of their names
+//!       sections one after the other, in the order of their names
 //! ```
-//! The hash finds every change that befell a file. Who made it is said by a signature beside it, see [`signature`].
+//! The hash detects every accidental change of a file. A signature beside it proves its origin, see [`signature`].
 
 pub mod contents;
 pub mod signature;
@@ -22,13 +22,13 @@ use abi::foreign::{is_name, is_plain};
 use abi::image::{sha256, sha256_without};
 use std::fmt;
 
-/// The first bytes. The line feed shows a transfer that took the file for a text.
+/// The first bytes. The line feed reveals a transfer in text mode.
 pub const MAGIC: [u8; 8] = *b"FRICPKG\n";
-/// Of the format.
+/// Version of the format.
 pub const VERSION: u32 = 1;
-/// How a package's name ends.
+/// Extension of a package's file name.
 pub const EXTENSION: &str = "fricpkg";
-/// No package is larger: nobody fills the memory of a rig's computer with one.
+/// Size limit, so that no package can exhaust the memory of a rig's computer.
 pub const MOST_BYTES: u64 = 256 << 20;
 
 const HASH: std::ops::Range<usize> = 24..56;
@@ -38,15 +38,15 @@ const HASH: std::ops::Range<usize> = 24..56;
 pub struct Package {
     /// The version of `fric` that made it.
     pub fric: String,
-    /// Family of processors and operating system: `x86_64-linux`.
+    /// Processor family and operating system: `x86_64-linux`.
     pub target: String,
     /// Name of the rig.
     pub rig: String,
-    /// In the order of their names, which are different.
+    /// In the order of their names, which are unique.
     pub sections: Vec<Section>,
 }
 
-/// Some bytes under a name.
+/// Named bytes.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub struct Section {
     /// `control`, `plant`, `rig`, `source/rtfs.fric`.
@@ -55,38 +55,38 @@ pub struct Section {
     pub bytes: Vec<u8>,
 }
 
-/// Why a package is refused.
+/// Reason to refuse a package.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub enum Refusal {
-    /// It does not begin like one.
+    /// It does not begin like a package.
     NotAPackage,
-    /// It is of another version of the format.
+    /// It has another version of the format.
     Version(u32),
-    /// It is shorter or longer than it says.
+    /// Its length differs from the one in its header.
     Length {
-        /// Bytes that it says it has.
+        /// Length in the header, bytes.
         said: u64,
-        /// Bytes that it has.
+        /// Length of the file, bytes.
         found: u64,
     },
-    /// Its hash is another.
+    /// Its hash is wrong.
     Changed,
-    /// Its hash is right and its content impossible: whoever made it made a mistake.
+    /// Its hash is right but its content is invalid: its maker made an error.
     Malformed(String),
-    /// It is for another processor or system.
+    /// It is for another processor or operating system.
     Target {
-        /// What it is for.
+        /// Its target.
         said: String,
-        /// What this is.
+        /// This computer.
         here: String,
     },
     /// A section is missing.
     Missing(String),
-    /// It was made by another version of `fric`, whose plans may read differently.
+    /// It was made by another version of `fric`, whose plans may have another meaning.
     Maker {
-        /// Its maker.
+        /// Version of its maker.
         said: String,
-        /// Of this program.
+        /// Version of this program.
         here: String,
     },
     /// It is not signed, or not by a trusted key.
@@ -123,7 +123,7 @@ impl From<Malformed> for Refusal {
     }
 }
 
-/// Family of processors and operating system that this program runs on: `x86_64-linux`.
+/// Processor family and operating system of this program: `x86_64-linux`.
 pub fn here() -> String {
     format!("{}-{}", std::env::consts::ARCH, std::env::consts::OS)
 }
@@ -137,7 +137,7 @@ impl Package {
     /// Adds a section.
     ///
     /// # Panics
-    /// If there is one of that name: a package that was put together twice is a mistake.
+    /// If there is a section of that name: the caller has added it twice.
     pub fn add(&mut self, name: &str, bytes: Vec<u8>) {
         let at = self.sections.partition_point(|section| section.name.as_str() < name);
         assert!(self.sections.get(at).is_none_or(|section| section.name != name), "two sections `{name}`");
@@ -153,7 +153,7 @@ impl Package {
         found.map(|section| &section.bytes[..]).ok_or_else(|| Refusal::Missing(name.into()))
     }
 
-    /// The bytes of the file.
+    /// Encodes the file.
     pub fn to_bytes(&self) -> Vec<u8> {
         let table = |offsets: &[u64]| {
             let mut out = Vec::new();
@@ -188,10 +188,10 @@ impl Package {
         out
     }
 
-    /// Reads a file.
+    /// Decodes a file.
     ///
     /// # Errors
-    /// Whatever is not as [`Package::to_bytes`] made it: no bit may differ.
+    /// Any difference, even of one bit, from the output of [`Package::to_bytes`].
     pub fn read(bytes: &[u8]) -> Result<Package, Refusal> {
         let (Some(magic), Some(version)) = (bytes.get(..8), bytes.get(8..12)) else {
             return Err(Refusal::NotAPackage);
@@ -220,14 +220,14 @@ impl Package {
         let mut expected = None;
         for _ in 0..count {
             let name = String::decode(&mut reader)?;
-            // Names become those of files, and are shown: `source/std.friction.lugre.fric`.
+            // Names become parts of file names, and are displayed: `source/std.friction.lugre.fric`.
             let inside = |part: &str| is_plain(part) && !matches!(part, "" | "." | "..") && !part.contains('\\');
             if !name.split('/').all(inside) {
                 return Err(Refusal::Malformed(format!("a section is called {name:?}")));
             }
             let (offset, length) = (u64::decode(&mut reader)?, u64::decode(&mut reader)?);
             let hash: &[u8] = reader.take(32)?;
-            // Sections lie one behind the other, so that every byte belongs to exactly one.
+            // Sections follow each other without gaps, so that every byte belongs to exactly one.
             let next = *expected.get_or_insert(offset);
             let content = offset.checked_add(length).and_then(|end| bytes.get(offset as usize..end as usize));
             let Some(content) = content.filter(|_| offset == next) else {
@@ -248,7 +248,7 @@ impl Package {
         Ok(package)
     }
 
-    /// Whether its texts are what they should be: its rig has a name that can be part of a file's, the rest is shown.
+    /// Checks its texts: the rig's name must be fit for a file name, the other texts for display.
     fn named(&self) -> Result<(), Refusal> {
         let Package { fric, target, rig, .. } = self;
         if !is_name(rig) {
@@ -260,10 +260,10 @@ impl Package {
         }
     }
 
-    /// Whether this machine and this version can run it.
+    /// Checks that this machine and this version can run it.
     ///
     /// # Errors
-    /// What does not fit.
+    /// The mismatch.
     pub fn fits(&self, fric: &str) -> Result<(), Refusal> {
         if self.target != here() {
             return Err(Refusal::Target { said: self.target.clone(), here: here() });
@@ -321,7 +321,7 @@ mod tests {
         assert_eq!(Package::read(&longer), Err(Refusal::Length { said, found }));
     }
 
-    /// With a right hash, what does not make sense is told apart.
+    /// With a right hash, invalid content is a different error.
     #[test]
     fn a_table_that_lies_is_refused() {
         let mut bytes = package().to_bytes();
@@ -341,7 +341,7 @@ mod tests {
         assert!(why.contains("source/rtfs.fric") && why.contains("another hash"), "{why}");
     }
 
-    /// What a package is called becomes part of a file's name, and what it says is shown.
+    /// The name of a package becomes part of a file name, and its texts are displayed.
     #[test]
     fn names_that_leave_a_folder_or_act_on_a_terminal_are_refused() {
         let why = |package: &Package| Package::read(&package.to_bytes()).unwrap_err().to_string();

@@ -1,51 +1,51 @@
-//! Signatures beside packages, in the format of minisign: the stock tool checks them too. The only file that knows
+//! Signatures of packages in the format of minisign, which the minisign tool can verify too. The only file that uses
 //! `minisign_verify`.
 //!
-//! In: the bytes of a package and of its signature, keys that are trusted. Out: the key that signed it, or a refusal.
+//! In: the bytes of a package and of its signature, trusted keys. Out: the key that signed it, or a refusal.
 
 use super::Refusal;
 use minisign_verify::{PublicKey, Signature};
 use std::fs;
 use std::path::{Path, PathBuf};
 
-/// What is appended to the name of a package for that of its signature.
+/// Extension that is appended to a package's file name for its signature.
 pub const EXTENSION: &str = "minisig";
-/// Where the keys lie that a rig's computer trusts: files that end in `.pub`.
+/// Folder of the keys that a rig's computer trusts: files that end in `.pub`.
 pub const TRUSTED: &str = "/etc/fric/trusted";
 
-/// The signature's file beside a package's: `rtfs.fricpkg.minisig`.
+/// The signature file beside a package: `rtfs.fricpkg.minisig`.
 pub fn beside(package: &Path) -> PathBuf {
     let mut name = package.file_name().map(|name| name.to_os_string()).unwrap_or_default();
     name.push(format!(".{EXTENSION}"));
     package.with_file_name(name)
 }
 
-/// Keys that are trusted.
+/// The trusted keys.
 pub struct Trusted(Vec<Key>);
 
-/// A public key that is trusted.
+/// A trusted public key.
 struct Key {
-    /// The name of its file, without its ending.
+    /// The name of its file, without the extension.
     name: String,
-    /// As it is written, in base64.
+    /// Its base64 text.
     text: String,
     key: PublicKey,
 }
 
-/// Who signed a package, and when.
+/// The signer of a package, and the time.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub struct Signer {
     /// The name of the key.
     pub name: String,
-    /// s since 1970, from the comment that is part of what is signed; none if it does not say.
+    /// Time in s since 1970, from the trusted comment, which is signed too; none if the comment has no time.
     pub signed_s: Option<u64>,
 }
 
-/// What stands before the time in the trusted comment of a signature: the stock tool writes it too.
+/// Prefix of the time in the trusted comment of a signature; the minisign tool writes it too.
 const TIMESTAMP: &str = "timestamp:";
 
-/// The trusted comment of a signature made now. The time lies here and not in the package, so that equal texts still give
-/// equal packages; it is signed as the package is.
+/// The trusted comment of a new signature. The time is here and not in the package, so that equal texts still result in
+/// equal packages; it is signed like the package.
 pub fn comment(what: &str, now_s: u64) -> String {
     format!("{what}, {TIMESTAMP}{now_s}")
 }
@@ -57,7 +57,7 @@ fn timestamp(comment: &str) -> Option<u64> {
     digits.parse().ok()
 }
 
-/// The base64 of a public key in the text of its file, or alone.
+/// The base64 text of a public key, from the text of its file or alone.
 ///
 /// # Errors
 /// If it is no public key of minisign.
@@ -70,10 +70,10 @@ pub fn public_key(text: &str) -> Result<String, String> {
 }
 
 impl Trusted {
-    /// The keys in a folder, by the names of their files. There are none if there is no folder.
+    /// The keys in a folder, with the names of their files. Empty if the folder does not exist.
     ///
     /// # Errors
-    /// The key that cannot be read, and why: a key that is meant to protect must not be passed over.
+    /// The key that cannot be read, and the reason: a key that is meant to protect must not be skipped.
     pub fn in_folder(folder: &Path) -> Result<Trusted, String> {
         let entries = match fs::read_dir(folder) {
             Ok(entries) => entries,
@@ -97,12 +97,12 @@ impl Trusted {
         Ok(Trusted(keys))
     }
 
-    /// Whether none is trusted: then signatures are not asked for.
+    /// Whether no key is trusted: signatures are not required then.
     pub fn is_empty(&self) -> bool {
         self.0.is_empty()
     }
 
-    /// The names of the keys and the keys in base64, in the order of the names.
+    /// Names and base64 texts of the keys, in the order of the names.
     pub fn keys(&self) -> impl Iterator<Item = (&str, &str)> {
         self.0.iter().map(|key| (key.name.as_str(), key.text.as_str()))
     }

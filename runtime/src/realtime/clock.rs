@@ -1,30 +1,30 @@
-//! Time, as a whole number of nanoseconds since some instant: the real one, or one that tests and fast runs advance.
+//! Clocks in whole nanoseconds since an origin: the machine's, or one that tests and fast runs advance.
 
 use std::cell::Cell;
 use std::rc::Rc;
 
-/// Where time comes from.
+/// Source of time.
 pub trait Clock {
-    /// Nanoseconds since the clock's origin; never falls.
+    /// Nanoseconds since the clock's origin; never decreases.
     fn now_ns(&self) -> u64;
 
-    /// Returns when it shows this time: by sleeping, or by moving on.
+    /// Returns when the clock shows this time: by sleeping, or by advancing the clock.
     fn sleep_until(&self, until_ns: u64);
 }
 
-/// The machine's monotonic clock, counted from its making.
+/// The machine's monotonic clock, relative to its construction.
 #[derive(Clone, Copy, Debug)]
 pub struct Monotonic {
     origin_ns: u64,
 }
 
 impl Monotonic {
-    /// A clock that starts at 0 now.
+    /// A clock that shows 0 now.
     pub fn new() -> Monotonic {
         Monotonic { origin_ns: monotonic_ns() }
     }
 
-    /// What CLOCK_MONOTONIC showed at 0.
+    /// Value of CLOCK_MONOTONIC at the origin.
     pub fn origin_ns(&self) -> u64 {
         self.origin_ns
     }
@@ -41,12 +41,12 @@ impl Clock for Monotonic {
         monotonic_ns() - self.origin_ns
     }
 
-    /// Sleeps to an instant, not for a while: what came between does not add up.
+    /// Sleeps until an absolute time, so that delays in between do not accumulate.
     fn sleep_until(&self, until_ns: u64) {
         let until_ns = self.origin_ns.saturating_add(until_ns);
         let seconds = i64::try_from(until_ns / SECOND_NS).unwrap_or(i64::MAX);
         let until = libc::timespec { tv_sec: seconds, tv_nsec: (until_ns % SECOND_NS) as i64 };
-        // SAFETY: `until` is a valid time and outlives the call; what remains is not asked for.
+        // SAFETY: `until` is a valid time and outlives the call; the remaining time is not requested.
         let sleep = || unsafe {
             libc::clock_nanosleep(libc::CLOCK_MONOTONIC, libc::TIMER_ABSTIME, &until, std::ptr::null_mut())
         };
@@ -56,7 +56,7 @@ impl Clock for Monotonic {
 
 const SECOND_NS: u64 = 1_000_000_000;
 
-/// CLOCK_MONOTONIC: the same for every process of a machine.
+/// CLOCK_MONOTONIC: the same for all processes of a machine.
 pub fn monotonic_ns() -> u64 {
     let mut now = libc::timespec { tv_sec: 0, tv_nsec: 0 };
     // SAFETY: `now` is written by the call and outlives it.
@@ -65,7 +65,7 @@ pub fn monotonic_ns() -> u64 {
     now.tv_sec as u64 * SECOND_NS + now.tv_nsec as u64
 }
 
-/// Time that stands until it is moved. Copies show the same time.
+/// A clock that stands still until it is advanced. Clones share their time.
 #[derive(Clone, Default, Debug)]
 pub struct Simulated {
     now_ns: Rc<Cell<u64>>,
@@ -77,10 +77,10 @@ impl Simulated {
         Simulated::default()
     }
 
-    /// Moves on to `t_ns`.
+    /// Advances the clock to `t_ns`.
     ///
     /// # Panics
-    /// If that lies in the past: time never falls.
+    /// If that lies in the past: time never decreases.
     pub fn advance_to(&self, t_ns: u64) {
         assert!(t_ns >= self.now_ns.get(), "time would fall from {} to {t_ns} ns", self.now_ns.get());
         self.now_ns.set(t_ns);

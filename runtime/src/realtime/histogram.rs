@@ -1,23 +1,23 @@
-//! Times, counted in fixed logarithmic bins: what a loop can afford to write down in every cycle.
+//! Histogram of times in fixed logarithmic bins, cheap enough for every cycle of a loop.
 //!
 //! In: nanoseconds. Out: counts, extremes, quantiles. Never allocates.
 
-/// Upper end of the first bin.
+/// Upper edge of the first bin.
 const FIRST_NS: u64 = 100;
 
-/// Bins to an octave: neighbours are 9 % apart.
+/// Bins per octave: adjacent edges differ by 9 %.
 const PER_OCTAVE: usize = 8;
 
 /// From 100 ns to 107 s.
 const OCTAVES: usize = 30;
 
-/// One below 100 ns, those of the octaves, one above.
+/// One bin below 100 ns, those of the octaves, one above.
 const BINS: usize = 1 + OCTAVES * PER_OCTAVE + 1;
 
-/// 2^(1/8) … 2^(7/8) in units of 2⁻¹⁶: where the bins of an octave begin.
+/// 2^(1/8) … 2^(7/8) in units of 2⁻¹⁶: edges of the bins in an octave.
 const EDGES: [u64; PER_OCTAVE - 1] = [71_468, 77_936, 84_990, 92_682, 101_070, 110_218, 120_194];
 
-/// How often a time of each length came.
+/// Number of times in each bin, and exact extremes.
 #[derive(Clone, PartialEq, Eq)]
 pub struct Histogram {
     bins: [u64; BINS],
@@ -34,7 +34,7 @@ impl Default for Histogram {
 }
 
 impl Histogram {
-    /// Nothing counted yet.
+    /// An empty histogram.
     pub const fn new() -> Histogram {
         Histogram { bins: [0; BINS], count: 0, sum_ns: 0, min_ns: u64::MAX, max_ns: 0 }
     }
@@ -48,28 +48,28 @@ impl Histogram {
         self.max_ns = self.max_ns.max(ns);
     }
 
-    /// How many were counted.
+    /// Number of counted times.
     pub fn total(&self) -> u64 {
         self.count
     }
 
-    /// The longest, to the nanosecond; 0 of none.
+    /// The longest time, exact; 0 if empty.
     pub fn max_ns(&self) -> u64 {
         self.max_ns
     }
 
-    /// The shortest, to the nanosecond; 0 of none.
+    /// The shortest time, exact; 0 if empty.
     pub fn min_ns(&self) -> u64 {
         if self.count == 0 { 0 } else { self.min_ns }
     }
 
-    /// The mean; 0 of none.
+    /// The mean; 0 if empty.
     pub fn mean_ns(&self) -> u64 {
         (self.sum_ns / u128::from(self.count.max(1))) as u64
     }
 
-    /// The time that a fraction of all did not exceed, 0 to 1: the upper end of its bin, so never too good, and at most
-    /// 9 % too bad. 0 of none.
+    /// The quantile of a fraction, 0 to 1: the upper edge of its bin, so never too low, and at most 9 % too high. 0 if
+    /// empty.
     pub fn quantile_ns(&self, fraction: f64) -> u64 {
         let rank = (fraction * self.count as f64).ceil().max(1.0) as u64;
         let mut seen = 0;
@@ -80,14 +80,14 @@ impl Histogram {
         reached.map_or(self.max_ns, |bin| upper_ns(bin).min(self.max_ns))
     }
 
-    /// What was counted in each bin that is not empty: lower end, upper end, count.
+    /// Lower edge, upper edge and count of each bin that is not empty.
     pub fn bins(&self) -> impl Iterator<Item = (u64, u64, u64)> {
         let lower = |bin: usize| if bin == 0 { 0 } else { upper_ns(bin - 1) };
         let counted = self.bins.iter().enumerate().filter(|(_, count)| **count > 0);
         counted.map(move |(bin, &count)| (lower(bin), upper_ns(bin), count))
     }
 
-    /// Adds what another one counted.
+    /// Adds the counts of another histogram.
     pub fn add(&mut self, other: &Histogram) {
         self.bins.iter_mut().zip(other.bins).for_each(|(mine, theirs)| *mine += theirs);
         self.count += other.count;
@@ -97,7 +97,7 @@ impl Histogram {
     }
 }
 
-/// Which bin a time falls into.
+/// Index of the bin of a time.
 fn bin(ns: u64) -> usize {
     if ns < FIRST_NS {
         return 0;
@@ -110,7 +110,7 @@ fn bin(ns: u64) -> usize {
     1 + octave * PER_OCTAVE + EDGES.iter().filter(|&&edge| edge <= ratio).count()
 }
 
-/// Where a bin ends; the last one does not.
+/// Upper edge of a bin; the last one has none.
 fn upper_ns(bin: usize) -> u64 {
     let (octave, part) = (bin / PER_OCTAVE, bin % PER_OCTAVE);
     match part {

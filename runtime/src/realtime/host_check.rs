@@ -1,31 +1,31 @@
-//! What this machine has and lacks for a hard real-time loop, with the line that mends each.
+//! Checks of this machine for a hard real-time loop, with the command that fixes each problem.
 //!
-//! In: `/proc` and `/sys`. Out: findings as plain data. It changes nothing.
+//! In: `/proc` and `/sys`. Out: findings as plain data. Changes nothing.
 
 use std::fs;
 use std::path::{Path, PathBuf};
 
-/// How good it is.
+/// Assessment of a finding.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub enum Verdict {
     /// As it should be.
     Good,
-    /// It works, worse than it could, and nothing can be typed about it.
+    /// It works, but not optimally, and no command fixes it.
     Poor,
-    /// What to type to have it better.
+    /// A command improves it.
     Mend(String),
-    /// No real drive should run like this; what to type.
+    /// No real drive may run like this; the command that fixes it.
     Forbids(String),
 }
 
-/// One thing that was looked at.
+/// Result of one check.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub struct Finding {
-    /// What: `kernel`, `priority`, `can0`.
+    /// The topic: `kernel`, `priority`, `can0`.
     pub topic: String,
-    /// What was seen.
+    /// The observation.
     pub says: String,
-    /// What follows.
+    /// The assessment.
     pub verdict: Verdict,
 }
 
@@ -36,7 +36,7 @@ impl Finding {
     }
 }
 
-/// A machine, by its files below a root: `/`, or a made-up one in tests.
+/// A machine, by its files below a root: `/`, or an artificial one in tests.
 pub struct Host {
     root: PathBuf,
 }
@@ -52,7 +52,7 @@ const CAP_IPC_LOCK: u32 = 14;
 const CAP_SYS_NICE: u32 = 23;
 
 impl Host {
-    /// The machine whose files lie below a folder.
+    /// The machine whose files are below a folder.
     pub fn below(root: &Path) -> Host {
         Host { root: root.into() }
     }
@@ -61,7 +61,7 @@ impl Host {
         fs::read_to_string(self.root.join(path)).ok().map(|text| text.trim().to_string())
     }
 
-    /// Everything about the machine itself, in the order it is told.
+    /// All findings about the machine itself, in the order of the report.
     pub fn findings(&self) -> Vec<Finding> {
         let core = self.text("sys/devices/system/cpu/isolated").filter(|list| !list.is_empty());
         let mut found = vec![self.kernel(), self.rights(), self.core(core.as_deref())];
@@ -115,7 +115,7 @@ impl Host {
                 let last = last.rsplit(['-', ',']).next().unwrap_or_default().to_string();
                 let mend = match last.parse::<u32>() {
                     Ok(1..) => Verdict::Mend(format!("kernel command line: isolcpus={last} nohz_full={last}")),
-                    // One core can't be given away.
+                    // A single core cannot be reserved.
                     _ => Verdict::Poor,
                 };
                 Finding::new("core", "none isolated", mend)
@@ -133,7 +133,7 @@ impl Host {
         Some(Finding::new("governor", format!("{governor} on core {core}"), mend))
     }
 
-    /// How long the deepest sleep takes to wake from, and whether we may forbid it.
+    /// Exit latency of the deepest sleep state, and whether we may prevent it.
     fn sleep(&self) -> Option<Finding> {
         let state =
             |k: u32| self.text(&format!("sys/devices/system/cpu/cpu0/cpuidle/state{k}/latency"))?.parse::<u64>().ok();
@@ -169,8 +169,8 @@ impl Host {
         flags.split_whitespace().any(|flag| flag == "hypervisor").then(|| Finding::new("machine", says, Verdict::Poor))
     }
 
-    /// The thread that serves an interface's interrupts, where the kernel has such threads: it must stand above a loop of
-    /// this priority, or a loop that spins never sees its answer.
+    /// Priority of the thread that serves an interface's interrupts, where the kernel has such threads. It must be
+    /// above a loop of this priority, otherwise a loop that spins never receives its answer.
     pub fn interrupt(&self, interface: &str, priority: i32) -> Option<Finding> {
         let processes = fs::read_dir(self.root.join("proc")).ok()?;
         processes.flatten().find_map(|process| {
@@ -179,7 +179,7 @@ impl Host {
             // irq/27-can0
             (name.starts_with("irq/") && name.ends_with(&format!("-{interface}"))).then_some(())?;
             let stat = self.text(&format!("proc/{id}/stat"))?;
-            // The name may hold spaces; behind its parenthesis field 3 begins, and rt_priority is field 40.
+            // The name may contain spaces; field 3 follows its closing parenthesis, and rt_priority is field 40.
             let stands: i32 = stat.rsplit(')').next()?.split_whitespace().nth(37)?.parse().ok()?;
             let says = format!("{name} FIFO {stands}, loop {priority}");
             let above = Verdict::Mend(format!("chrt -f -p {} {id}", priority + 5));

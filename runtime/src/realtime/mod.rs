@@ -1,4 +1,4 @@
-//! Time as whole nanoseconds, how late a cycle is, and what a thread and a machine need to be real-time.
+//! Real-time support: clocks in nanoseconds, histograms of latencies, set-up of threads, and a check of the host.
 
 pub mod clock;
 pub mod histogram;

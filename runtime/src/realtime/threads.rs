@@ -1,22 +1,22 @@
-//! What a thread asks of Linux before it may call itself real-time, and what it was refused.
+//! Set-up of real-time threads on Linux, and what the system refused.
 //!
-//! In: wishes. Out: what was granted, and for each refusal its reason and the line that mends it. Knows no bus and no
-//! model. Nothing here belongs into a cycle: call it before the first one.
+//! In: wishes. Out: a set-up thread, and for each refusal its reason and remedy. Knows no bus and no model. Must be
+//! called before the first cycle, never in one.
 
 use std::fs::{self, File};
 use std::io::{self, Write};
 
-/// What a loop wishes for.
+/// Wishes of a loop.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct Wishes {
-    /// Priority under SCHED_FIFO, 1 to 99. Above what may wait, below what the loop waits for: 80 suits a loop whose
-    /// interrupt threads stand at 85 and whose watchdog stands at 90.
+    /// Priority under SCHED_FIFO, 1 to 99. It must be above threads that may wait, and below threads that the loop
+    /// waits for: 80 suits a loop whose interrupt threads have 85 and whose watchdog has 90.
     pub priority: i32,
-    /// The core to stay on; any if there is none.
+    /// The core to stay on; any if none.
     pub core: Option<usize>,
-    /// Whether all memory of the process is locked.
+    /// Whether to lock all memory of the process.
     pub memory: bool,
-    /// Whether processors may not sleep deeply meanwhile.
+    /// Whether to keep processors out of deep sleep states.
     pub awake: bool,
 }
 
@@ -26,47 +26,47 @@ impl Default for Wishes {
     }
 }
 
-/// What can be refused.
+/// A wish that can be refused.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum What {
-    /// mlockall: no page of the process is ever fetched in a cycle.
+    /// mlockall: no page of the process is fetched during a cycle.
     Memory,
-    /// SCHED_FIFO: nothing of lower priority delays the loop.
+    /// SCHED_FIFO: no thread of lower priority delays the loop.
     Priority,
-    /// The core of its own.
+    /// Affinity to one core.
     Core,
-    /// `/dev/cpu_dma_latency` held at 0: no deep sleep of processors to wake from.
+    /// `/dev/cpu_dma_latency` held at 0: no deep sleep state to wake from.
     Awake,
-    /// Timer slack of 1 ns instead of the default 50 µs. SCHED_FIFO has none; it matters where that is refused.
+    /// Timer slack of 1 ns instead of the default 50 µs. SCHED_FIFO has none; it matters where SCHED_FIFO is refused.
     Slack,
 }
 
-/// A wish that was not granted.
+/// A wish that was refused.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub struct Refusal {
-    /// Which one.
+    /// The wish.
     pub what: What,
-    /// As the kernel says it.
+    /// The kernel's message.
     pub reason: String,
-    /// What somebody can type, or write, to have it granted.
+    /// The command or setting that permits it.
     pub remedy: &'static str,
 }
 
-/// A thread that has been set up. Dropping it gives priority, core and processor sleep back; memory stays locked.
+/// A thread that has been set up. Dropping it restores priority, core and processor sleep; memory stays locked.
 #[derive(Debug)]
 pub struct RealTime {
     refused: Vec<Refusal>,
     priority_set: bool,
     cores_before: Option<libc::cpu_set_t>,
-    // Open is what counts: the kernel forgets the wish when it is closed.
+    // The kernel honours the request while the file is open.
     _awake: Option<File>,
 }
 
-/// Bytes of stack touched ahead.
+/// Size of the stack touched in advance, bytes.
 const STACK: usize = 512 * 1024;
 
-/// Sets up the calling thread: locks the memory of the process, touches its stack, then asks for the rest. Threads that it
-/// starts later begin with ordinary priority.
+/// Sets up the calling thread: locks the memory of the process, touches its stack, then requests the rest. Threads that
+/// it starts later begin with ordinary priority.
 pub fn enter(wishes: &Wishes) -> RealTime {
     let mut refused = Vec::new();
     let mut ask = |what: What, result: io::Result<()>, remedy| match result {
@@ -98,8 +98,8 @@ pub fn enter(wishes: &Wishes) -> RealTime {
     RealTime { refused, priority_set, cores_before, _awake: awake }
 }
 
-/// Sets up the calling thread as one that must run although the thread that started it hangs: on any core but that one's if
-/// there is another, and before it as far as the system lets it.
+/// Sets up the calling thread as one that must run even if the thread that started it hangs: on another core if that
+/// one is bound to a single core and there is another, and with this priority if the system permits it.
 pub fn stand_by(priority: i32) {
     if let Some(now) = cores() {
         // SAFETY: all bytes 0 is an empty set.
@@ -112,9 +112,9 @@ pub fn stand_by(priority: i32) {
                 }
             }
         }
-        // SAFETY: the set was read by the kernel, and is counted only.
+        // SAFETY: the kernel has filled the set, which is only counted.
         if unsafe { libc::CPU_COUNT(&now) } == 1 {
-            // A set without a core of this machine is refused, and it stays where it is.
+            // If the set contains no core of this machine, the call is refused and the affinity stays unchanged.
             // SAFETY: the set is valid and outlives the call; 0 is the calling thread.
             unsafe { libc::sched_setaffinity(0, size_of::<libc::cpu_set_t>(), &others) };
         }
@@ -123,7 +123,7 @@ pub fn stand_by(priority: i32) {
 }
 
 impl RealTime {
-    /// What was not granted; nothing is what a real drive needs.
+    /// The refused wishes; a real drive requires that there are none.
     pub fn refused(&self) -> &[Refusal] {
         &self.refused
     }
@@ -143,16 +143,16 @@ impl Drop for RealTime {
     }
 }
 
-/// What the calling thread has suffered since its start.
+/// Page faults and preemptions of the calling thread since its start.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct Suffered {
-    /// Pages that had to be mapped, and those that had to be fetched.
+    /// Minor and major page faults.
     pub page_faults: u64,
-    /// Times it was interrupted by another thread.
+    /// Number of involuntary context switches.
     pub preemptions: u64,
 }
 
-/// What the calling thread has suffered until now: the difference over a run should be 0.
+/// Page faults and preemptions of the calling thread so far: the difference over a run should be 0.
 pub fn suffered() -> Suffered {
     // SAFETY: all bytes 0 is a valid rusage.
     let mut usage: libc::rusage = unsafe { std::mem::zeroed() };
@@ -162,7 +162,7 @@ pub fn suffered() -> Suffered {
     Suffered { page_faults: (usage.ru_minflt + usage.ru_majflt) as u64, preemptions: usage.ru_nivcsw as u64 }
 }
 
-/// The first core kept free of everything else by `isolcpus=`, if this thread may use it.
+/// The first core reserved by `isolcpus=`, if this thread may use it.
 pub fn isolated_core() -> Option<usize> {
     let list = fs::read_to_string("/sys/devices/system/cpu/isolated").ok()?;
     let first: String = list.chars().take_while(char::is_ascii_digit).collect();
@@ -178,12 +178,12 @@ fn lock_memory() -> io::Result<()> {
     checked(unsafe { libc::mlockall(libc::MCL_CURRENT | libc::MCL_FUTURE) })
 }
 
-/// Grows the stack now by what the loop may need, so that no call in it does.
+/// Touches the stack that the loop may need, so that no call in it causes a page fault.
 #[inline(never)]
 fn touch_stack() {
     let mut stack = [0u8; STACK];
     for page in stack.chunks_mut(4096) {
-        // SAFETY: a plain store into a page of this function's own array; volatile, so that it happens.
+        // SAFETY: a plain store into a page of this function's own array; volatile, so that it is not optimised away.
         unsafe { std::ptr::write_volatile(&mut page[0], 1) };
     }
     std::hint::black_box(&stack);
@@ -208,7 +208,7 @@ fn cores() -> Option<libc::cpu_set_t> {
 }
 
 fn stay_on(core: usize) -> io::Result<()> {
-    // CPU_SET does nothing beyond the set, and an empty set is refused by the kernel.
+    // CPU_SET ignores cores beyond the set, and the kernel refuses an empty set.
     // SAFETY: all bytes 0 is an empty set.
     let mut set: libc::cpu_set_t = unsafe { std::mem::zeroed() };
     if core < 8 * size_of::<libc::cpu_set_t>() {
@@ -231,7 +231,7 @@ mod tests {
 
     #[test]
     fn what_is_refused_is_told_with_its_remedy() {
-        // A thread of its own: what is granted ends with it.
+        // In a thread of its own, so that granted wishes end with it.
         let refused = std::thread::spawn(|| {
             let wishes = Wishes { priority: 1000, core: Some(100_000), memory: false, awake: false };
             enter(&wishes).refused().to_vec()
@@ -264,7 +264,7 @@ mod tests {
     #[test]
     fn a_page_fetched_is_counted() {
         let before = suffered().page_faults;
-        // So much never comes from memory that the process has used before.
+        // So much memory never comes from pages that the process has used before.
         let mut fresh = vec![0u8; 64 << 20];
         (0..fresh.len()).step_by(4096).for_each(|at| fresh[at] = 1);
         std::hint::black_box(&fresh);
