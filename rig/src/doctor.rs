@@ -1,9 +1,9 @@
-//! Whether this computer can keep time: what a cycle needs, what it gets, and what to change.
+//! Checks whether this computer meets real-time requirements: what a cycle needs, what it gets, and what to change.
 
 use runtime::realtime::threads::{self, Wishes};
 use std::fs;
 
-/// One line for each thing that is looked at.
+/// The report, one line per finding.
 pub fn doctor() -> String {
     let mut lines = Vec::new();
     let mut line = |good: bool, what: &str, remedy: &str| {

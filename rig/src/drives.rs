@@ -1,17 +1,17 @@
 //! `fric-rig drives`: simulated drives and devices of a packed rig, on buses that other programs can reach.
 //!
-//! In: a package that has been verified, ways to the outside. Out: frames, and how the states change. The part of the
-//! system behind the drives is the package's own compiled plant.
+//! In: a verified package, doors. Out: frames, and reports of state changes. The plant behind the drives is the
+//! package's own compiled program.
 
 use crate::packed::Open;
 use crate::words;
 use runtime::drive::serve::{Doors, Refused, Served};
 use runtime::hil::emergency;
 
-/// Lets them live until Ctrl-C, or for so many s; gives the exit code.
+/// Serves them until Ctrl-C, or for this time, s; returns the exit code.
 ///
 /// # Errors
-/// Why they cannot.
+/// The reason why they cannot be served.
 pub fn drives(open: &Open, doors: &Doors, duration: Option<f64>, quiet: bool) -> Result<u8, String> {
     let rig = &open.contents.rig;
     let served = match Served::open(rig, Some(open.program("plant")?), doors) {

@@ -1,7 +1,7 @@
-//! The `fric-rig` command: what runs on the computer beside the drives.
+//! The `fric-rig` command, for the computer beside the drives.
 //!
-//! In: a package that `fric build` made. Out: a running rig, or the reason why not. Has no compiler: what it runs was
-//! checked and compiled elsewhere, and is refused if a single bit of it changed on the way.
+//! In: a package that `fric build` made. Out: a running rig, or the reason of a refusal. Contains no compiler: the
+//! package was checked and compiled elsewhere, and is refused if a single bit of it has changed since.
 
 #![deny(clippy::print_stdout, clippy::print_stderr, reason = "a closed pipe must not panic: see words.rs")]
 
@@ -230,7 +230,7 @@ struct Store {
     dir: PathBuf,
 }
 
-/// A time with its unit: `60s`, `500 ms`.
+/// Parses a time with its unit: `60s`, `500 ms`.
 fn seconds(text: &str) -> Result<f64, String> {
     let at = text.find(|c: char| c.is_ascii_alphabetic()).ok_or("a time needs its unit, for example 60s")?;
     let unit = abi::unit::Unit::parse(text[at..].trim()).map_err(|part| format!("`{part}` is not a known unit"))?;
@@ -247,7 +247,7 @@ fn address(text: &str) -> Result<(String, String), String> {
     Ok((bus.into(), address.into()))
 }
 
-/// A package that may run here, on the buses that it names.
+/// Opens a package that may run here, on the buses that it names.
 fn opened(package: &std::path::Path, trust: &Trust) -> Result<packed::Open, String> {
     let open = packed::open(package, &trust.keys.trusted)?;
     let may = open.may_run(&open.contents.rig.buses, false, trust.allow_unsigned);
@@ -266,7 +266,7 @@ fn installed(args: &Install) -> Result<String, String> {
     store.install(&open.package.rig, &open.bytes, open.signature.as_deref())
 }
 
-/// A command in one or several words.
+/// Joins a command of one or several words.
 fn said(words: &[String]) -> Option<String> {
     let what = words.join(" ");
     let what = what.trim();
@@ -306,7 +306,7 @@ fn ran(args: &Run) -> Result<u8, String> {
     run::run(&wanted)
 }
 
-/// What a command that goes on for a while came to: its own exit code, or why it failed.
+/// The exit code of a command that runs for a while: its own one, or that of a failure.
 fn ended(code: Result<u8, String>) -> ExitCode {
     match code {
         Ok(code) => ExitCode::from(code),
@@ -322,7 +322,7 @@ fn main() -> ExitCode {
     let done = match &args.command {
         Command::Check(check) => opened(&check.package, &check.trust).map(|open| open.describe()),
         Command::Run(run) if run.fast && !run.check && run.duration.is_none() => {
-            // Nobody can say `stop` there, and hours of it fill a disk within minutes.
+            // Nobody can send `stop` to it, and hours of simulated time fill a disk within minutes.
             words::error("--fast needs --for: how much simulated time? For example `--for 60s`");
             return ExitCode::from(2);
         }

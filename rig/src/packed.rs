@@ -1,6 +1,6 @@
-//! Packages as they are opened for running: verified first, in every respect, and only then looked into.
+//! Opens packages for running: they are verified completely before their content is decoded.
 //!
-//! In: a file, trusted keys. Out: an [`Open`] package, or why it is refused.
+//! In: a file, trusted keys. Out: an [`Open`] package, or the reason of its refusal.
 
 use abi::Instance;
 use abi::rig::Bus;
@@ -13,20 +13,20 @@ use runtime::record::log::Sections;
 use std::fs;
 use std::path::Path;
 
-/// Of this program: packages are made by the same one.
+/// Version of this program: packages must be made by the same version.
 pub const VERSION: &str = env!("CARGO_PKG_VERSION");
 
 /// A package that may run here.
 pub struct Open {
-    /// Its bytes as they lie in the file, and those of its signature.
+    /// The bytes of its file.
     pub bytes: Vec<u8>,
     /// The text of its signature, if there is one beside it.
     pub signature: Option<String>,
-    /// What was asked to be packed, and for whom.
+    /// The package.
     pub package: Package,
-    /// Its parts.
+    /// Its decoded parts.
     pub contents: Contents,
-    /// Who signed it, if signatures are asked for.
+    /// Its signer, if signatures are required.
     pub signer: Option<Signer>,
 }
 
@@ -51,11 +51,11 @@ fn read(path: &Path) -> Result<(Vec<u8>, Option<String>), String> {
 /// Reads and verifies a package.
 ///
 /// # Errors
-/// Why it is refused, in words.
+/// A message with the reason of its refusal.
 pub fn open(path: &Path, trusted: &Path) -> Result<Open, String> {
     let about = |why: &dyn std::fmt::Display| format!("{}: {why}", path.display());
     let (bytes, signature) = read(path)?;
-    // First who made it, then what it is: nothing of an unknown maker is looked into.
+    // The signature is verified first: nothing of an unknown maker is decoded.
     let keys = Trusted::in_folder(trusted)?;
     let signer = keys.signer(&bytes, signature.as_deref()).map_err(|why| about(&why))?;
     let package = Package::read(&bytes).map_err(|why| about(&why))?;
@@ -71,7 +71,7 @@ pub fn open(path: &Path, trusted: &Path) -> Result<Open, String> {
 /// Refuses a package that was signed before another one.
 ///
 /// # Errors
-/// If the one at `current` is signed by a trusted key and this one was signed earlier, or does not say when.
+/// If the package at `current` is signed by a trusted key, and this one was signed earlier or has no time.
 pub fn not_older(open: &Open, current: &Path, trusted: &Path) -> Result<(), String> {
     let Ok((bytes, signature)) = read(current) else { return Ok(()) };
     let installed = Trusted::in_folder(trusted)?.signer(&bytes, signature.as_deref()).ok().flatten();
@@ -90,10 +90,10 @@ pub fn not_older(open: &Open, current: &Path, trusted: &Path) -> Result<(), Stri
 }
 
 impl Open {
-    /// Refuses to run what no trusted key has signed where a real drive may be moved.
+    /// Refuses to run a package without a trusted signature where a real drive may be moved.
     ///
     /// # Errors
-    /// If no trusted key signed it, not all of these buses are simulated, and `allowed` does not say that it may run.
+    /// If no trusted key signed it, one of these buses is not simulated, and `allowed` is false.
     pub fn may_run(&self, buses: &[Bus], simulated: bool, allowed: bool) -> Result<(), String> {
         let real = buses.iter().find(|bus| !bus.address.starts_with("sim:"));
         let Some(bus) = real.filter(|_| self.signer.is_none() && !simulated && !allowed) else { return Ok(()) };
@@ -113,10 +113,10 @@ impl Open {
         self.contents.head.clone()
     }
 
-    /// What judges sets of parameters while it runs.
+    /// The judge of parameter changes at run time.
     ///
     /// # Errors
-    /// Why it does not fit the control program.
+    /// The reason why it does not match the control program.
     pub fn judge(&self, control: &Instance) -> Result<Judge, String> {
         Judge::new(self.contents.live.clone(), self.program("judge")?, control)
     }
@@ -124,16 +124,16 @@ impl Open {
     /// One of its programs, ready to start: `control`, `plant` or `judge`.
     ///
     /// # Errors
-    /// Why it cannot be loaded.
+    /// The reason why it cannot be loaded.
     pub fn program(&self, name: &str) -> Result<Instance, String> {
         let bytes = self.package.section(name).map_err(|why| why.to_string())?;
-        // SAFETY: the bytes are those that `fric build` wrote, as every hash says, and where keys are trusted as a
-        // signature says; who installs a package on a computer without keys vouches for it.
+        // SAFETY: `fric build` wrote these bytes, as all hashes confirm, and, where keys are trusted, a signature. On a
+        // computer without keys the person who installs a package vouches for it.
         let model = unsafe { runtime::image::load(bytes) };
         model.map(|model| model.instance()).map_err(|why| format!("its program `{name}`: {why}"))
     }
 
-    /// In words.
+    /// Its description as text.
     pub fn describe(&self) -> String {
         let Package { fric, target, rig, sections } = &self.package;
         let signer = match (&self.signer, &self.signature) {

@@ -1,14 +1,14 @@
-//! Installed packages: one is current, the one before it is kept, and changing them is one step that happens or not.
+//! Store of installed packages: one is current, the previous one is kept, and a change is atomic.
 //!
 //! ```text
 //! DIR/packages/HASH.fricpkg    every package under its hash, with its signature
-//! DIR/current -> packages/…    what runs when the rig is started next
-//! DIR/previous -> packages/…   what `rollback` goes back to
+//! DIR/current -> packages/…    runs when the rig is started next
+//! DIR/previous -> packages/…   target of `rollback`
 //! DIR/log/                     recordings
 //! DIR/lock                     locked by the rig that runs here
 //! ```
-//! A package is written under another name, flushed to the disk and renamed; a link is made under another name and
-//! renamed over the old one. So after a power cut there is the old state or the new one.
+//! A package is written under a temporary name, flushed to the disk and renamed; a link is created under a temporary
+//! name and renamed over the old one. So after a power failure there is either the old state or the new one.
 
 use runtime::package::hash;
 use runtime::package::signature::EXTENSION as SIGNATURE;
@@ -18,10 +18,10 @@ use std::os::unix::fs::symlink;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-/// Where packages lie unless something else is asked for.
+/// Default folder of the packages.
 pub const DEFAULT: &str = "/var/lib/fric";
 
-/// Locked by the rig that runs here; its process stands in it.
+/// Locked by the rig that runs here; contains its process id.
 const LOCK: &str = "lock";
 
 /// A folder of packages.
@@ -31,12 +31,12 @@ pub struct Store {
 }
 
 impl Store {
-    /// At a folder, which need not exist yet.
+    /// A store in a folder, which need not exist yet.
     pub fn at(dir: &Path) -> Store {
         Store { dir: dir.to_path_buf() }
     }
 
-    /// Where the link of a package points that has this SHA-256.
+    /// Target of the link for the package with this SHA-256.
     pub fn target(hash: &str) -> PathBuf {
         let name: String = hash.chars().take(32).collect();
         Path::new("packages").join(format!("{name}.{}", runtime::package::EXTENSION))
@@ -45,7 +45,7 @@ impl Store {
     /// Makes a verified package the current one. `rig`: its name; `signature`: the text beside it.
     ///
     /// # Errors
-    /// Why not; what was current then still is.
+    /// A message; the current package is unchanged then.
     pub fn install(&self, rig: &str, bytes: &[u8], signature: Option<&str>) -> Result<String, String> {
         let packages = self.dir.join("packages");
         let about = |path: &Path, error: io::Error| format!("cannot write {}: {error}", path.display());
@@ -57,7 +57,7 @@ impl Store {
         let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
         whole(&path, bytes).map_err(|error| about(&path, error))?;
         let beside = packages.join(format!("{name}.{SIGNATURE}"));
-        // Where it has none, an older signature of the same bytes does no harm.
+        // Without a signature, an older signature of the same bytes does no harm.
         if let Some(text) = signature {
             whole(&beside, text.as_bytes()).map_err(|error| about(&beside, error))?;
         }
@@ -72,10 +72,10 @@ impl Store {
         Ok(format!("{rig} is the current package: {name}\n"))
     }
 
-    /// Makes the package before the current one current again.
+    /// Makes the previous package the current one again.
     ///
     /// # Errors
-    /// If there is none, or why it cannot be done.
+    /// If there is none, or the operation fails.
     pub fn rollback(&self) -> Result<String, String> {
         let current = self.current_target();
         let said = self.fall_back()?;
@@ -85,10 +85,11 @@ impl Store {
         Ok(said)
     }
 
-    /// As [`rollback`](Self::rollback), from a package that does not start: nothing goes back to that one by itself.
+    /// Like [`rollback`](Self::rollback), for a package that does not start: it does not become the previous package,
+    /// so that nothing returns to it automatically.
     ///
     /// # Errors
-    /// If there is none before it, or why it cannot be done.
+    /// If there is no previous package, or the operation fails.
     pub fn fall_back(&self) -> Result<String, String> {
         let Some(previous) = self.before() else {
             return Err(format!("there is no package before the current one in {}", self.dir.display()));
@@ -100,17 +101,17 @@ impl Store {
         Ok(format!("back to {}\n", previous.display()))
     }
 
-    /// The package before the current one; none if that is the current one again.
+    /// The previous package; none if it is the current one again.
     fn before(&self) -> Option<PathBuf> {
         let previous = fs::read_link(self.dir.join("previous")).ok();
         previous.filter(|previous| Some(previous) != self.current_target().as_ref())
     }
 
-    /// Keeps others from running a rig here, for as long as the file lives: the system lets go of it however the process
+    /// Prevents other rigs in this folder while the file is open: the system releases the lock however the process
     /// ends.
     ///
     /// # Errors
-    /// Who runs one, or why the folder cannot be used.
+    /// If another rig runs, or the folder cannot be used.
     pub fn lock(&self) -> Result<File, String> {
         let path = self.dir.join(LOCK);
         let about = |error: io::Error| format!("cannot use {}: {error}; --dir names another folder", path.display());
@@ -121,7 +122,7 @@ impl Store {
         while let Err(why) = file.try_lock() {
             match why {
                 TryLockError::Error(error) => return Err(about(error)),
-                // Somebody may just look whether a rig runs.
+                // Another process may just be checking whether a rig runs.
                 TryLockError::WouldBlock if looks > 0 => {
                     looks -= 1;
                     std::thread::sleep(Duration::from_millis(10));
@@ -146,7 +147,7 @@ impl Store {
         file.is_ok_and(|file| matches!(file.try_lock_shared(), Err(TryLockError::WouldBlock)))
     }
 
-    /// Where the link of the current package points.
+    /// Target of the link of the current package.
     pub fn current_target(&self) -> Option<PathBuf> {
         fs::read_link(self.dir.join("current")).ok()
     }
@@ -156,15 +157,15 @@ impl Store {
         self.current_target().map(|target| self.dir.join(target))
     }
 
-    /// Whether there is a package before the current one to go back to.
+    /// Whether there is a previous package to return to.
     pub fn took_over(&self) -> bool {
         self.before().is_some()
     }
 
-    /// What is installed, and what runs.
+    /// Installed packages and the running one, as text.
     ///
     /// # Errors
-    /// If nothing is.
+    /// If nothing is installed.
     pub fn status(&self) -> Result<String, String> {
         let mut words = String::new();
         for (name, target) in [("current", self.current_target()), ("previous", self.before())] {
@@ -172,7 +173,7 @@ impl Store {
                 words += &format!("{name}: {}\n", target.display());
             }
         }
-        // That of a process that was killed stays behind it.
+        // The state of a killed process remains.
         if let Ok(state) = fs::read_to_string(self.dir.join("state"))
             && self.is_locked()
         {
@@ -181,7 +182,7 @@ impl Store {
         if words.is_empty() { Err(format!("nothing is installed in {}", self.dir.display())) } else { Ok(words) }
     }
 
-    /// Points a link at a package, at once.
+    /// Sets a link to a package atomically.
     fn link(&self, name: &str, target: &Path) -> Result<(), String> {
         let (link, fresh) = (self.dir.join(name), self.dir.join(format!(".{name}.{}", std::process::id())));
         let done = fs::remove_file(&fresh)
@@ -193,11 +194,11 @@ impl Store {
     }
 }
 
-/// Writes a file whole or not at all, and onto the disk before it has its name.
+/// Writes a file completely or not at all, and flushes it to the disk before it gets its name.
 fn whole(path: &Path, bytes: &[u8]) -> io::Result<()> {
     let name = path.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
     let fresh = path.with_file_name(format!(".{name}.{}", std::process::id()));
-    // One of that name was left by a process that was killed.
+    // A file of that name is from a killed process.
     let _ = fs::remove_file(&fresh);
     let mut file = File::create_new(&fresh)?;
     let written = file.write_all(bytes).and_then(|()| file.sync_all()).and_then(|()| fs::rename(&fresh, path));
@@ -241,7 +242,7 @@ mod tests {
         store.rollback().unwrap();
         assert_eq!(current(dir.path()).rig, "two", "there and back");
         assert_eq!(store.status().unwrap().lines().count(), 2);
-        // What was left because it did not start is not gone back to.
+        // A package that did not start is not returned to.
         store.fall_back().unwrap();
         assert_eq!(current(dir.path()).rig, "one");
         assert!(!store.took_over() && store.fall_back().is_err() && store.rollback().is_err());

@@ -1,7 +1,7 @@
-//! Keys that this computer trusts: shown, and registered.
+//! Lists and registers the keys that this computer trusts.
 //!
-//! In: a folder, a name and a public key. Out: the keys in it, or one more. A key that is there is never replaced: whoever
-//! wants that takes its file away first.
+//! In: a folder, a name and a public key. Out: the keys in it, or one more. An existing key is never replaced: its file
+//! must be removed first.
 
 use abi::foreign::is_component;
 use runtime::package::signature::{Trusted, public_key};
@@ -9,7 +9,7 @@ use std::fs::{self, File};
 use std::io::{ErrorKind, Write};
 use std::path::Path;
 
-/// The keys of a folder, a line each: name and key.
+/// The keys of a folder, one per line: name and key.
 ///
 /// # Errors
 /// The key that cannot be read.
@@ -18,10 +18,10 @@ pub fn keys(folder: &Path) -> Result<String, String> {
     Ok(trusted.keys().map(|(name, key)| format!("{name} {key}\n")).collect())
 }
 
-/// Registers a key. `first`: only where none is trusted yet.
+/// Registers a key. `first`: only if no key is trusted yet.
 ///
 /// # Errors
-/// Why it is not registered.
+/// The reason why it is not registered.
 pub fn register(folder: &Path, name: &str, key: &str, first: bool) -> Result<String, String> {
     if !is_component(name) {
         return Err(format!("{name:?} is no name of a key: it becomes that of a file"));
@@ -40,7 +40,8 @@ pub fn register(folder: &Path, name: &str, key: &str, first: bool) -> Result<Str
         _ => format!("cannot write {}: {error}", path.display()),
     };
     fs::create_dir_all(folder).map_err(about)?;
-    // A key is read whole or not at all: it is written beside its name and linked to it, which fails where there is one.
+    // A key must be read completely or not at all: it is written to a temporary file and linked to its name, which
+    // fails if that exists.
     let fresh = folder.join(format!(".{name}.{}", std::process::id()));
     let text = format!("untrusted comment: public key {name}, registered by fric-rig\n{key}\n");
     let written = File::create_new(&fresh)

@@ -1,7 +1,7 @@
-//! What is said on the two output streams. A reader that went away loses words, nothing else.
+//! Output on the two standard streams. A reader that has closed its end loses text and nothing else happens.
 //!
-//! Much of it comes from elsewhere (names in packages, on buses, in folders): what would act on a terminal is shown as an
-//! escape. The program itself uses no colour.
+//! Many texts come from elsewhere (names in packages, on buses, in folders): characters that would control a terminal
+//! are escaped. The program itself uses no colour.
 
 use abi::foreign::shown;
 use std::io::Write;
@@ -11,18 +11,18 @@ pub fn print(text: &str) {
     let _ = is_read(text);
 }
 
-/// Prints to the standard output; returns whether somebody reads it.
+/// Prints to the standard output; returns whether the stream is still open.
 pub fn is_read(text: &str) -> bool {
     let mut out = std::io::stdout().lock();
     out.write_all(shown(text).as_bytes()).and_then(|()| out.flush()).is_ok()
 }
 
-/// Says something on the standard error that is no failure.
+/// Prints a report that is no failure to the standard error.
 pub fn report(text: &str) {
     let _ = std::io::stderr().lock().write_all(shown(text).as_bytes());
 }
 
-/// Reports a failure on the standard error.
+/// Prints a failure to the standard error.
 pub fn error(why: &str) {
     let _ = writeln!(std::io::stderr().lock(), "error: {}", shown(why.trim_end()));
 }
