@@ -1,7 +1,7 @@
-//! Runs a packed rig: against the drives on its buses, or against simulated ones.
+//! Runs a packed rig, with the drives on its buses or with simulated ones.
 //!
-//! In: a package that has been verified. Out: recordings, and how it ended. Another package is taken over between two
-//! cycles, while no drive has torque, and never otherwise.
+//! In: a verified package. Out: recordings, and the result of the run. Another package is taken over between two
+//! cycles, and only while no drive has torque.
 
 use crate::packed::{self, Open};
 use crate::store::Store;
@@ -28,60 +28,60 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
-/// Cycles whose loss a killed process may cost, as a time.
+/// Longest recording that a killed process may lose.
 const BLOCK_NS: u64 = 100_000_000;
-/// How often the state is told and the installed package looked at.
+/// Interval at which the state is written and the installed package checked.
 const LOOK: Duration = Duration::from_millis(100);
-/// [`Gauges::stage`] from which on drives may have torque, and the one of torque off after a stop.
+/// [`Gauges::stage`] from which on drives may have torque, and that of torque off after a stop.
 const ENABLE: u64 = runtime::drive::Step::Enable as u64;
 const TORQUE_OFF: u64 = 103;
 
-/// What to run, and how.
+/// Arguments of a run.
 pub struct Wanted<'a> {
-    /// A package, or the current one of the store.
+    /// A package; none: the current one of the store.
     pub package: Option<&'a Path>,
-    /// Folder of the public keys that are trusted.
+    /// Folder of the trusted public keys.
     pub trusted: &'a Path,
-    /// It may run on real buses though no trusted key has signed it.
+    /// Whether it may run on real buses without a trusted signature.
     pub allow_unsigned: bool,
-    /// Packages, logs, state.
+    /// Folder of packages, logs, state.
     pub dir: &'a Path,
     /// Simulated buses, drives and devices.
     pub sim: bool,
-    /// As fast as it computes, where it is simulated.
+    /// In simulated time, as fast as the computation.
     pub fast: bool,
-    /// The checks of the start-up only.
+    /// Only the checks of the start-up.
     pub check: bool,
-    /// Time the model runs, s.
+    /// Time for which the model runs, s.
     pub duration: Option<f64>,
     /// `can0=ADDRESS`.
     pub buses: &'a [(String, String)],
-    /// The recording.
+    /// File of the recording.
     pub log: Option<&'a Path>,
-    /// How large it may become.
+    /// Its size limits.
     pub limits: Limits,
 }
 
-/// How it ended.
+/// Result of a run.
 pub enum Ended {
-    /// As asked.
+    /// It ended as requested.
     Asked,
-    /// By safety or a condition: why.
+    /// The safety supervisor or a condition stopped it; the reason.
     Stopped(String),
-    /// It had passed its start-up checks and waited for its operator, and what it waited with was lost: why.
+    /// It had passed its start-up checks and was waiting for its operator when it failed; the reason.
     Lost(String),
     /// Another package has been installed and may be taken over now.
     Replaced,
 }
 
-/// Runs until it ends; gives the exit code.
+/// Runs until the end; returns the exit code.
 pub fn run(wanted: &Wanted) -> Result<u8, String> {
     let store = Store::at(wanted.dir);
     if wanted.package.is_none() && store.current_target().is_none() {
         let current = wanted.dir.join("current");
         return Err(format!("nothing is installed in {}: there is no {}", wanted.dir.display(), current.display()));
     }
-    // One rig in a folder: its socket and its state are there. In simulated time there is neither.
+    // Only one rig may run in a folder, because its socket and its state are there. In simulated time it has neither.
     let _alone = (!wanted.fast).then(|| store.lock()).transpose()?;
     emergency::guard();
     let mut fell_back = false;
@@ -92,7 +92,7 @@ pub fn run(wanted: &Wanted) -> Result<u8, String> {
         let ended = packed::open(&path, wanted.trusted).and_then(|open| once(wanted, &open, &store, &target));
         let ended = match ended {
             Ok(ended) => ended,
-            // What runs instead is what ran before it; if that does not start either, nothing runs.
+            // The previous package runs instead; if that does not start either, nothing runs.
             Err(why) if wanted.package.is_none() && !fell_back && store.took_over() => {
                 words::error(&format!("{NOT_STARTED}{why}"));
                 words::error(&store.fall_back()?);
@@ -107,7 +107,7 @@ pub fn run(wanted: &Wanted) -> Result<u8, String> {
                 words::error(&format!("stopped: {why}"));
                 return Ok(3);
             }
-            // It did start: whether an older package shall take its place is for a person to say.
+            // The rig had started: only a person may decide whether an older package takes its place.
             Ended::Lost(why) => return Err(format!("refused: {why}")),
             Ended::Replaced => {
                 fell_back = false;
@@ -139,7 +139,7 @@ fn once(wanted: &Wanted, open: &Open, store: &Store, target: &Path) -> Result<En
     let simulated = wanted.sim || rig.buses.iter().all(|bus| bus.address.starts_with("sim:"));
     let mut options = Options { arms_itself: simulated, checks_only: wanted.check, ..Options::default() };
     options.start.simulated = simulated;
-    // What is late between this process and itself says nothing of the drives.
+    // Delays between this process and itself say nothing about the drives.
     options.start.missed = if simulated { 0.05 } else { 0.0 };
     if simulated && holds_and_pushes(&rig) {
         options.start.sign_test = SignTest::Skip;
@@ -148,7 +148,7 @@ fn once(wanted: &Wanted, open: &Open, store: &Store, target: &Path) -> Result<En
     options.look = look_ahead(&rig, &open.program("plant")?)?;
     options.control.needs_look = rig.needs_look;
     let fast = simulated && wanted.fast;
-    // Simulated time stands still meanwhile.
+    // With simulated time the step time does not matter.
     if let Some(why) = watches::too_slow(&rig, &control).filter(|_| !fast) {
         return Err(format!("refused: {why}"));
     }
@@ -203,7 +203,8 @@ fn once(wanted: &Wanted, open: &Open, store: &Store, target: &Path) -> Result<En
         Ok(None) => {}
         Err(error) => return Err(format!("the log {} is not whole: {error}", path.display())),
     }
-    // Whoever stops a rig for which another package waits wants that one next, unless the process itself is to end.
+    // An operator who stops a rig while another package waits wants that package to run next, unless the process itself
+    // is to end.
     let waits = wanted.package.is_none() && store.current_target().is_some_and(|current| current != target);
     let goes_on = waits && wanted.duration.is_none() && !wanted.check && emergency::asked().is_none();
     match end {
@@ -215,7 +216,7 @@ fn once(wanted: &Wanted, open: &Open, store: &Store, target: &Path) -> Result<En
     }
 }
 
-/// The buses of this computer.
+/// Opens the buses of this computer.
 fn buses(rig: &Rig, time: &Simulation) -> Result<Vec<Box<dyn Bus>>, String> {
     let open = |bus: &abi::rig::Bus| {
         let options = can::Options { bit_rate: Some(bus.bit_rate).filter(|rate| *rate > 0), ..can::Options::default() };
@@ -227,7 +228,7 @@ fn buses(rig: &Rig, time: &Simulation) -> Result<Vec<Box<dyn Bus>>, String> {
     rig.buses.iter().map(open).collect()
 }
 
-/// Where the recording goes, and its head: all that a replay needs.
+/// File and head of the recording; the head contains everything that a replay needs.
 fn log(wanted: &Wanted, open: &Open, rig: &Rig) -> Result<(Settings, Sections), String> {
     let mut head = open.head();
     let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
@@ -244,11 +245,11 @@ fn log(wanted: &Wanted, open: &Open, rig: &Rig) -> Result<(Settings, Sections), 
     Ok((settings, head))
 }
 
-/// Threads beside the cycle: they tell the state, take commands, and see that another package has been installed.
+/// Threads beside the cycle: they write the state, accept commands, and detect that another package has been installed.
 struct Attendant {
     over: Arc<AtomicBool>,
     replaced: Arc<AtomicBool>,
-    /// Whether the rig has been seen to wait for its operator.
+    /// Whether the rig has passed its start-up checks and waited for its operator.
     waited: Arc<AtomicBool>,
     threads: Vec<std::thread::JoinHandle<()>>,
     dir: PathBuf,
@@ -282,7 +283,7 @@ impl Attendant {
                     let other =
                         installed.as_ref().is_some_and(|store| store.current_target().as_ref() != Some(&target));
                     if other && idle && !replaced.swap(true, Ordering::Relaxed) {
-                        // It ends with the cycle that takes the command: no drive has torque then.
+                        // The rig ends with the cycle that accepts the command: no drive has torque then.
                         stopper.stop();
                     }
                     std::thread::sleep(LOOK);
@@ -298,7 +299,7 @@ impl Attendant {
                     if over.load(Ordering::Relaxed) {
                         break;
                     }
-                    // Who connects and says nothing keeps nobody waiting.
+                    // A client that connects and sends nothing must not block the others.
                     let desk = desk.clone();
                     std::thread::spawn(move || desk.attend(&stream));
                 }
@@ -311,7 +312,7 @@ impl Attendant {
 impl Drop for Attendant {
     fn drop(&mut self) {
         self.over.store(true, Ordering::Relaxed);
-        // Wakes the one that waits for somebody to call.
+        // Wakes the thread that waits for connections.
         let _ = UnixStream::connect(socket(&self.dir));
         for thread in self.threads.drain(..) {
             let _ = thread.join();
@@ -325,7 +326,7 @@ fn socket(dir: &Path) -> PathBuf {
     dir.join("control")
 }
 
-/// Writes the state where `status` reads it.
+/// Writes the state to the file that `status` reads.
 fn tell(dir: &Path, target: &Path, gauges: &Gauges) {
     let number = |gauge: &std::sync::atomic::AtomicU64| gauge.load(Ordering::Relaxed);
     let text = format!(
@@ -338,7 +339,7 @@ fn tell(dir: &Path, target: &Path, gauges: &Gauges) {
         parts::warning(number(&gauges.log_free)).map_or(String::new(), |warning| format!("; {warning}")),
     );
     let fresh = dir.join(".state");
-    // A disk that is full is no reason to disturb the cycle.
+    // A full disk is no reason to disturb the cycle.
     let _ = fs::write(&fresh, text).and_then(|()| fs::rename(&fresh, dir.join("state")));
 }
 
@@ -349,11 +350,11 @@ struct Desk {
     judge: Judge,
 }
 
-/// How long somebody who has connected may take to say what he wants.
+/// Time within which a connected client must send its command.
 const SPEAKS: Duration = Duration::from_secs(1);
 
 impl Desk {
-    /// Takes one command and says what became of it.
+    /// Receives one command and sends its answer.
     fn attend(&self, stream: &UnixStream) {
         let mut line = String::new();
         let _ = stream.set_read_timeout(Some(SPEAKS));
@@ -364,7 +365,7 @@ impl Desk {
         let _ = (&*stream).write_all(format!("{}\n", said.err().unwrap_or_else(|| "ok".into())).as_bytes());
     }
 
-    /// `@NS COMMAND`: a command and when it was said, by the monotonic clock of this computer.
+    /// Executes `@NS COMMAND`: a command and the time at which it was given, by the monotonic clock of this computer.
     fn carry_out(&self, line: &str) -> Result<(), String> {
         let stamped = line.strip_prefix('@').and_then(|rest| rest.split_once(' '));
         let (stamp, said) = match stamped.and_then(|(ns, said)| Some((Stamp::Wall(ns.parse().ok()?), said))) {
@@ -375,7 +376,7 @@ impl Desk {
             "enable" => Command::Enable,
             "arm" => Command::Arm,
             "reset" => return Err(format!("refused: {NO_RESET}")),
-            // Speakers do not wait for each other.
+            // Clients do not wait for each other.
             "stop" => {
                 self.stopper.stop();
                 return Ok(());
@@ -392,7 +393,7 @@ impl Desk {
         };
         let ticket = operator().say_at(command, stamp).map_err(refused)?;
         loop {
-            // Others speak meanwhile.
+            // Other clients can send meanwhile.
             let answer = operator().answer(ticket);
             match answer {
                 Some(Answer::Taken) => return Ok(()),
@@ -403,10 +404,10 @@ impl Desk {
     }
 }
 
-/// Most bytes of a command.
+/// Longest command, bytes.
 const MOST_SAID: u64 = 1 << 16;
 
-/// Says something to the rig that runs.
+/// Sends a command to the running rig.
 pub fn say(dir: &Path, what: &str) -> Result<String, String> {
     let about = |error: std::io::Error| format!("no rig runs in {}: {error}", dir.display());
     let Stamp::Wall(now_ns) = Stamp::wall() else { unreachable!("that is what it gives") };
@@ -418,7 +419,7 @@ pub fn say(dir: &Path, what: &str) -> Result<String, String> {
         return Err(format!("the rig in {} did not answer: {what} is not known to act", dir.display()));
     }
     match line.trim() {
-        // Stability takes a compiler.
+        // A stability check requires the compiler.
         "ok" if what.starts_with("set ") => Ok(format!(
             "{what}\n  not judged: whether the fixed step (E0702) and the contacts are stable with it; `fric predict --set` is\n"
         )),
@@ -427,23 +428,23 @@ pub fn say(dir: &Path, what: &str) -> Result<String, String> {
     }
 }
 
-/// How often the state is looked at for somebody who follows it, and how often it is told at least.
+/// Polling interval of the state for a follower, and longest interval between two outputs.
 const FOLLOWS: (Duration, Duration) = (Duration::from_millis(50), Duration::from_secs(1));
 
-/// Tells the state of the rig that runs: at once when it goes on to another stage, else once a second; until it ends, or
-/// nobody reads any more.
+/// Prints the state of the running rig: at once when its stage changes, otherwise once per second; until the rig ends,
+/// or nobody reads the output any more.
 ///
 /// # Errors
-/// If none runs.
+/// If no rig runs.
 pub fn follow(dir: &Path) -> Result<String, String> {
     let read = || fs::read_to_string(dir.join("state")).ok();
-    // The stage stands between the package and the counters.
+    // The stage is between the package and the counters.
     let stage =
         |state: &str| state.split(" cycles").next().and_then(|head| head.rsplit_once(", ")).map(|it| it.0.to_string());
     let store = Store::at(dir);
     let mut last: Option<(String, std::time::Instant)> = None;
     while store.is_locked() {
-        // Between two packages there is none for a moment.
+        // During the change of packages there is no state for a moment.
         let state = read().unwrap_or_default();
         let now = stage(&state).unwrap_or_default();
         if !state.is_empty() && last.as_ref().is_none_or(|(before, told)| *before != now || told.elapsed() >= FOLLOWS.1)
@@ -461,14 +462,15 @@ pub fn follow(dir: &Path) -> Result<String, String> {
     Ok(format!("the rig has ended; {} says how, if `start` started it\n", dir.join("log").join("rig.out").display()))
 }
 
-/// How long a rig that was just started is looked at.
+/// Time for which a newly started rig is monitored.
 const FIRST: Duration = Duration::from_secs(1);
-/// How long it may take to tell which package it runs, and one that runs already to take another over.
+/// Time within which it must report the package it runs, and within which a rig that runs already must take over
+/// another.
 const TELLS: Duration = Duration::from_secs(10);
-/// What the rig says when it goes back.
+/// Message of a rig that returns to the previous package.
 const NOT_STARTED: &str = "the new package does not start: ";
 
-/// Whom a rig that is started trusts.
+/// Signatures that a rig to be started trusts.
 #[derive(Clone, Copy)]
 pub struct Trust<'a> {
     /// As [`Wanted::trusted`].
@@ -477,23 +479,23 @@ pub struct Trust<'a> {
     pub allow_unsigned: bool,
 }
 
-/// Starts the current package in a process of its own, which outlives this one. `hash`: of the package that must be it;
-/// `limits`: how large its logs may become.
+/// Starts the current package in a process of its own, which outlives this one. `hash`: of the package that must be the
+/// current one; `limits`: size limits of its logs.
 ///
 /// # Errors
-/// What the rig said if it ended within its first second, or runs another package than the current one.
+/// The message of the rig, if it ended within its first second or runs another package than the current one.
 pub fn start(dir: &Path, hash: Option<&str>, trust: Trust, limits: Limits) -> Result<String, String> {
     let store = Store::at(dir);
     let Some(current) = store.current_target() else {
         return Err(format!("nothing is installed in {}", dir.display()));
     };
-    // A rig that runs may have tried it and gone back before anybody asked.
+    // A running rig may have tried that package and returned to the previous one before this request.
     let asked = hash.map_or_else(|| current.clone(), Store::target);
     let out = dir.join("log").join("rig.out");
     let about = |error: std::io::Error| format!("cannot start a rig in {}: {error}", dir.display());
     let mut child = None;
     if UnixStream::connect(socket(dir)).is_err() && current == asked {
-        // That of a process that was killed.
+        // State of a killed process.
         let _ = fs::remove_file(dir.join("state"));
         let file = fs::File::create(&out).map_err(about)?;
         let program = std::env::current_exe().map_err(about)?;
@@ -511,21 +513,21 @@ pub fn start(dir: &Path, hash: Option<&str>, trust: Trust, limits: Limits) -> Re
         if let Some(one) = &mut child
             && let Some(status) = one.try_wait().map_err(about)?
         {
-            // Unless somebody else started one in the same moment.
+            // Unless another process has started one at the same time.
             if !store.is_locked() {
                 return Err(format!("it does not start ({status}): {}; {}", said(&out), back(&store, &asked)));
             }
             child = None;
         }
         if store.current_target().as_ref() != Some(&asked) {
-            // Only once it can be spoken to is it seen that a rig runs, and no second one started beside it.
+            // Only once the rig accepts connections do others see that it runs, and start no second one beside it.
             while UnixStream::connect(socket(dir)).is_err() && begun.elapsed() < TELLS {
                 if child.as_mut().is_some_and(|child| !matches!(child.try_wait(), Ok(None))) {
                     break;
                 }
                 std::thread::sleep(Duration::from_millis(20));
             }
-            // What was started by somebody else writes elsewhere.
+            // A rig started by another process writes its output elsewhere.
             let why = if child.is_some() { said(&out) } else { "the rig that runs told why".into() };
             return Err(format!("it does not start: {why}; {}", back(&store, &asked)));
         }
@@ -544,13 +546,13 @@ pub fn start(dir: &Path, hash: Option<&str>, trust: Trust, limits: Limits) -> Re
     }
 }
 
-/// The package that the state tells of.
+/// The package named in the state.
 fn runs(dir: &Path) -> Option<PathBuf> {
     let state = fs::read_to_string(dir.join("state")).ok()?;
     state.split_once(": ").map(|(target, _)| PathBuf::from(target))
 }
 
-/// Why the rig did not start, from what it said.
+/// Reason why the rig did not start, from its output.
 fn said(out: &Path) -> String {
     let said = fs::read_to_string(out).unwrap_or_default();
     let why = said.lines().rev().find_map(|line| line.split_once(NOT_STARTED).map(|(_, why)| why));
@@ -558,7 +560,7 @@ fn said(out: &Path) -> String {
     why.or_else(error).or_else(|| said.trim().lines().last()).unwrap_or_default().to_string()
 }
 
-/// Goes back to the package before the one that does not start, unless the rig has done so itself.
+/// Returns to the package before the one that does not start, unless the rig has done so itself.
 fn back(store: &Store, asked: &Path) -> String {
     match store.current_target() {
         Some(current) if current != asked => format!("back to {}", current.display()),
