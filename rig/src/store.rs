@@ -226,7 +226,7 @@ mod tests {
     }
 
     #[test]
-    fn the_package_before_is_kept_and_comes_back() {
+    fn the_previous_package_is_kept_and_can_be_restored() {
         let dir = tempfile::tempdir().unwrap();
         let store = Store::at(dir.path());
         assert!(store.status().unwrap_err().starts_with("nothing is installed in "));
@@ -263,7 +263,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_interrupted_leaves_what_was_current() {
+    fn an_interrupted_change_leaves_the_current_package() {
         let dir = tempfile::tempdir().unwrap();
         let store = Store::at(dir.path());
         install(&store, "one");

@@ -148,7 +148,7 @@ mod tests {
     }
 
     #[test]
-    fn the_verdict_is_of_the_latest_cycle() {
+    fn the_assessment_depends_on_the_latest_cycle() {
         assert_eq!(late(49_000).fit(), Fit::Fit);
         assert_eq!(late(51_000).fit(), Fit::AtSync);
         assert_eq!(late(201_000).fit(), Fit::NotForTorque);

@@ -773,7 +773,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_but_safe_values_leaves_before_arming() {
+    fn outputs_stay_at_safe_values_before_arming() {
         let mut supervisor = Supervisor::new(&[LIMITS], &[DRIVE], PATIENCE, 1_000_000).unwrap();
         assert_eq!(supervisor.judge(&[1.5], &at(0.0)), DriveCommand::Wait);
         assert_eq!(supervisor.permitted(), [0.0]);
@@ -781,7 +781,7 @@ mod tests {
     }
 
     #[test]
-    fn a_request_within_its_limits_passes_to_the_bit() {
+    fn a_request_within_its_limits_is_permitted_unchanged() {
         let odd = OutputLimits { safe: 0.1, ..FREE };
         let mut supervisor = armed(odd, PATIENCE);
         for request in [0.3, -0.999, 1.0 / 3.0, 2.0, -1.0, f64::MIN_POSITIVE] {
@@ -791,7 +791,7 @@ mod tests {
     }
 
     #[test]
-    fn range_slew_and_power_bind() {
+    fn range_slew_and_power_limit_the_output() {
         let mut free = armed(FREE, PATIENCE);
         assert_eq!(sent(&mut free, 5.0, 0.0), 2.0);
         assert!(free.clamps()[0].has(Clamps::RANGE));
@@ -810,7 +810,7 @@ mod tests {
     }
 
     #[test]
-    fn outputs_come_up_from_safe() {
+    fn outputs_ramp_up_from_safe_values() {
         let patience = Timeouts { ramp: 4, ..PATIENCE };
         let mut supervisor = armed(FREE, patience);
         let seen: Vec<f64> = (0..6).map(|_| sent(&mut supervisor, 1.0, 0.0)).collect();
@@ -818,7 +818,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_a_number_stops_the_rig_in_the_same_cycle() {
+    fn a_request_that_is_not_finite_trips_in_the_same_cycle() {
         for bad in [f64::NAN, f64::INFINITY, f64::NEG_INFINITY] {
             let mut supervisor = armed(LIMITS, PATIENCE);
             sent(&mut supervisor, 0.1, 0.0);
@@ -833,7 +833,7 @@ mod tests {
     }
 
     #[test]
-    fn too_fast_too_far_or_not_a_number_is_a_quick_stop() {
+    fn excess_speed_or_travel_or_nan_causes_a_quick_stop() {
         let mut fast = armed(FREE, PATIENCE);
         assert_eq!(fast.judge(&[1.0], &at(-100.1)), DriveCommand::QuickStop);
         assert_eq!((fast.permitted(), fast.cause()), (&[0.0][..], Some(Cause::Speed(0, -100.1))));
@@ -845,7 +845,7 @@ mod tests {
     }
 
     #[test]
-    fn speed_that_grows_against_the_torque_is_a_run_away() {
+    fn acceleration_against_the_torque_is_a_run_away() {
         let mut supervisor = armed(FREE, PATIENCE);
         let mut last = DriveCommand::Follow;
         let mut speed = 1.0;
@@ -871,7 +871,7 @@ mod tests {
     }
 
     #[test]
-    fn a_load_that_brakes_what_a_servo_drives_is_no_run_away() {
+    fn a_load_that_brakes_a_servo_is_no_run_away() {
         let outputs = [FREE, OutputLimits { drive: Some(1), ..FREE }];
         let mut supervisor = Supervisor::new(&outputs, &[DRIVE, DRIVE], PATIENCE, 1_000_000).unwrap();
         supervisor.arm();
@@ -883,7 +883,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_clamped_too_long_is_stopped() {
+    fn an_output_clamped_for_too_long_causes_a_stop() {
         let mut supervisor = armed(LIMITS, PATIENCE);
         for _ in 0..4 {
             assert_eq!(supervisor.judge(&[9.0], &at(0.0)), DriveCommand::Follow);
@@ -917,7 +917,7 @@ mod tests {
     }
 
     #[test]
-    fn standing_drives_are_disabled_at_once() {
+    fn drives_at_standstill_are_disabled_at_once() {
         let mut supervisor = armed(FREE, PATIENCE);
         supervisor.trip(Cause::Drive(0));
         assert_eq!(supervisor.judge(&[1.0], &at(0.5)), DriveCommand::QuickStop);
@@ -926,7 +926,7 @@ mod tests {
     }
 
     #[test]
-    fn a_graver_cause_overtakes_a_controlled_stop() {
+    fn a_more_severe_cause_replaces_a_controlled_stop() {
         let mut supervisor = armed(LIMITS, PATIENCE);
         for _ in 0..10 {
             sent(&mut supervisor, 1.0, 0.0);
@@ -942,7 +942,7 @@ mod tests {
     }
 
     #[test]
-    fn a_slew_that_would_take_for_ever_does_not() {
+    fn a_very_slow_slew_ends_at_the_time_out() {
         let mut supervisor = armed(OutputLimits { slew: 1e-3, ..LIMITS }, PATIENCE);
         supervisor.outputs[0].slew = f64::INFINITY;
         sent(&mut supervisor, 1.0, 0.0);
@@ -962,7 +962,7 @@ mod tests {
     }
 
     #[test]
-    fn limits_are_narrowed_and_never_widened() {
+    fn limits_can_be_narrowed_but_not_widened() {
         let mut supervisor = armed(FREE, PATIENCE);
         assert_eq!(sent(&mut supervisor, 1.9, 0.0), 1.9);
         assert_eq!(supervisor.narrow(0, -0.5, 0.5, 10.0), Ok(()));
@@ -980,7 +980,7 @@ mod tests {
     }
 
     #[test]
-    fn limits_that_cannot_be_kept_are_refused() {
+    fn contradictory_limits_are_refused() {
         let refused = |output, drive| Supervisor::new(&[output], &[drive], PATIENCE, 1_000_000).err();
         let range = |low, high, safe| refused(OutputLimits { low, high, safe, ..LIMITS }, DRIVE);
         assert_eq!(range(1.0, -1.0, 0.0), Some(Refused::Range(0)));

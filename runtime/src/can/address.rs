@@ -120,7 +120,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_address_is_read_and_written() {
+    fn addresses_survive_formatting_and_parsing() {
         for (text, written) in [
             ("can0", "socketcan:can0"),
             ("socketcan:vcan1", "socketcan:vcan1"),
@@ -139,7 +139,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_wrong_is_said() {
+    fn errors_of_an_address_are_reported() {
         for (text, said) in [
             ("", "no address of a bus"),
             ("sim:", "lacks the name"),

@@ -95,7 +95,7 @@ mod tests {
     }
 
     #[test]
-    fn what_it_does_not_define_has_none() {
+    fn frames_outside_of_canopen_have_no_name() {
         for frame in [
             Frame::extended(0x181, &[]),
             Frame::new(0x000, &[]),

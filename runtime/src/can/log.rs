@@ -116,7 +116,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_wrong_with_a_line_is_said() {
+    fn errors_of_a_line_are_reported() {
         for (line, said) in [
             ("can0 181#", "has a time, an interface and a frame"),
             ("(12) can0", "has a time, an interface and a frame"),

@@ -150,7 +150,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_sent_is_compared_and_does_not_come_in() {
+    fn a_sent_frame_is_compared_and_not_received() {
         let world = Simulation::new();
         let mut bus = replay(LOG, &world).expect("a log");
         bus.send(Frame::new(0x181, &[1])).expect("as recorded");

@@ -445,7 +445,7 @@ mod tests {
     }
 
     #[test]
-    fn an_adapter_answers_what_a_computer_asks() {
+    fn an_adapter_answers_the_commands_of_a_computer() {
         let mut door = Slcan::door(None, Monotonic::new()).expect("a pseudo-terminal");
         let path = door.path().expect("a door has a path").to_path_buf();
         let mut computer = OpenOptions::new().read(true).write(true).open(path).expect("it opens");
@@ -476,7 +476,7 @@ mod tests {
     }
 
     #[test]
-    fn a_link_comes_and_goes_with_its_door() {
+    fn a_link_exists_as_long_as_its_door() {
         let folder = tempfile::tempdir().expect("a folder");
         let link = folder.path().join("can0");
         let door = Slcan::door(Some(&link), Monotonic::new()).expect("a door");

@@ -501,7 +501,7 @@ mod tests {
 
     /// The answer to a client's first frame may arrive before the pause after the handshake has ended.
     #[test]
-    fn who_sends_at_once_hears_the_answer() {
+    fn a_client_that_sends_at_once_receives_the_answer() {
         let clock = Monotonic::new();
         let mut server = Server::listen(0, false, clock).expect("a port");
         let mut tcp = TcpStream::connect(("127.0.0.1", server.port())).expect("it listens");
@@ -534,7 +534,7 @@ mod tests {
     }
 
     #[test]
-    fn a_gateway_that_says_other_things_is_refused() {
+    fn a_gateway_with_unexpected_answers_is_refused() {
         let listener = TcpListener::bind(("127.0.0.1", 0)).expect("a port");
         let port = listener.local_addr().expect("an address").port();
         let other = std::thread::spawn(move || {

@@ -216,7 +216,7 @@ DefaultValue=Servo 400
 ";
 
     #[test]
-    fn objects_are_read_with_all_that_matters() {
+    fn objects_are_read_with_all_their_attributes() {
         let mut objects = read(SHEET, 5).expect("the sheet is right");
         assert_eq!(objects.get(Object(0x1000, 0)), Some(0x20192));
         assert_eq!(objects.get(Object(0x1018, 1)), Some(0x1AF));
@@ -230,13 +230,13 @@ DefaultValue=Servo 400
     }
 
     #[test]
-    fn a_configuration_goes_before_a_default() {
+    fn a_configured_value_takes_precedence_over_a_default() {
         let text = "[6072]\nParameterName=Max\nDataType=6\nAccessType=rw\nDefaultValue=3000\nParameterValue=1500\n";
         assert_eq!(read(text, 1).unwrap().get(Object(0x6072, 0)), Some(1500));
     }
 
     #[test]
-    fn mistakes_have_their_line() {
+    fn mistakes_name_their_line() {
         let told = |text: &str| {
             let mistakes = read(text, 1).expect_err("a mistake");
             mistakes.iter().map(Mistake::to_string).collect::<Vec<_>>()

@@ -636,7 +636,7 @@ mod tests {
     }
 
     #[test]
-    fn mapping_has_its_rules() {
+    fn mapping_follows_the_rules_of_the_standard() {
         let mut node = device();
         let refused = |abort| Outcome::Failed(Failure::Aborted(abort));
         let entry = Object(0x1600, 1);
@@ -664,7 +664,7 @@ mod tests {
     }
 
     #[test]
-    fn heartbeats_are_sent_and_watched() {
+    fn heartbeats_are_produced_and_monitored() {
         let mut node = device();
         assert_eq!(write(&mut node, Object(0x1017, 0), 20, 2), Outcome::Done);
         assert_eq!(write(&mut node, Object(0x1016, 1), 0x7F_0005, 4), Outcome::Done);
@@ -681,7 +681,7 @@ mod tests {
     }
 
     #[test]
-    fn guarding_is_answered_and_watched() {
+    fn guarding_is_answered_and_monitored() {
         let mut node = device();
         write(&mut node, Object(0x100C, 0), 10, 2);
         write(&mut node, Object(0x100D, 0), 2, 1);
@@ -705,7 +705,7 @@ mod tests {
     }
 
     #[test]
-    fn stopped_it_takes_only_network_management() {
+    fn a_stopped_node_accepts_only_nmt() {
         let mut node = device();
         node.receive(&Nmt::Stop.frame(3), 0, &mut |_| {});
         let request = Frame::new(0x603, &[0x40, 0, 0x10, 0, 0, 0, 0, 0]);

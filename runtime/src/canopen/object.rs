@@ -305,7 +305,7 @@ mod tests {
     }
 
     #[test]
-    fn an_abort_is_told_in_words() {
+    fn an_abort_has_a_message() {
         assert_eq!(Abort::ALL.len(), 31);
         for abort in Abort::ALL {
             assert!(abort.meaning().is_some_and(|text| abort.to_string().starts_with(text)));

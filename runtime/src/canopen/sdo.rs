@@ -453,7 +453,7 @@ mod tests {
     }
 
     #[test]
-    fn every_length_goes_both_ways() {
+    fn every_length_is_transferred_in_both_directions() {
         let mut wire = Wire::new();
         for length in 1..=200u8 {
             let bytes: Vec<u8> = (0..length).map(|i| i.wrapping_mul(7).wrapping_add(length)).collect();
@@ -470,7 +470,7 @@ mod tests {
     }
 
     #[test]
-    fn the_frames_are_those_of_the_standard() {
+    fn the_frames_match_the_standard() {
         let mut sent = Vec::new();
         let mut client = Client::new(3, 1);
         client.write(Object(0x6040, 0), &[0x0F, 0], 0, &mut |frame| sent.push(frame.to_string()));
@@ -510,7 +510,7 @@ mod tests {
     }
 
     #[test]
-    fn a_lost_or_bent_frame_ends_the_transfer() {
+    fn a_lost_or_corrupted_frame_ends_the_transfer() {
         // Loss of each frame of a segmented read and write: the request times out, and the next one works.
         for writes in [false, true] {
             for lost in 0..8 {
@@ -537,7 +537,7 @@ mod tests {
     }
 
     #[test]
-    fn a_doubled_segment_is_noticed() {
+    fn a_doubled_segment_is_detected() {
         let mut wire = Wire::new();
         let mut open = Vec::new();
         wire.client.read(Object(0x1008, 0), 0, &mut |frame| open.push(frame));

@@ -283,7 +283,7 @@ mod tests {
     }
 
     #[test]
-    fn services_are_told_in_words() {
+    fn services_have_a_text() {
         assert_eq!(Service::Nmt(Some(Nmt::Start), 0).to_string(), "NMT start, all nodes");
         let emergency = Emergency { code: 0x8130, register: 0x11, vendor: [0; 5] };
         assert_eq!(

@@ -101,7 +101,7 @@ mod tests {
     }
 
     #[test]
-    fn integrators_and_fast_modes_stand_side_by_side() {
+    fn integrators_and_fast_modes_are_resolved_together() {
         // x' = v, v' = −1e8 v: eigenvalues of very different magnitude.
         let found = modes(2, &[0.0, 1.0, 0.0, -1e8]).unwrap();
         assert_eq!(found[0], Mode { real: 0.0, imaginary: 0.0 });
@@ -118,7 +118,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_finite_has_no_modes() {
+    fn a_matrix_that_is_not_finite_has_no_modes() {
         assert_eq!(modes(1, &[f64::NAN]), None);
         assert_eq!(modes(0, &[]), Some(Vec::new()));
     }

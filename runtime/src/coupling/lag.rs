@@ -138,7 +138,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_decay_is_that_of_the_platform() {
+    fn the_decay_agrees_with_the_exponential_of_the_platform() {
         for k in 0..400 {
             let x = 0.05 * f64::from(k);
             assert!((remaining(x) - (-x).exp()).abs() < 4e-15, "{x}: {} {}", remaining(x), (-x).exp());
@@ -147,7 +147,7 @@ mod tests {
     }
 
     #[test]
-    fn the_mean_is_exact_whatever_the_steps() {
+    fn the_mean_is_exact_for_any_steps() {
         let course = |steps: u64| {
             let mut lag = Lag::new(0.6e-3);
             lag.send(800_000, 2.0);

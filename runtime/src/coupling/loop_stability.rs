@@ -354,7 +354,7 @@ mod tests {
 
     /// Published figures of the exact discrete loop (docs/prediction.md), for σ0/J = 1e5 1/s².
     #[test]
-    fn the_limits_are_those_of_the_table() {
+    fn the_limits_agree_with_the_published_table() {
         let table = [
             (1e-3, 500.0, 0.5, 2.37),
             (0.5e-3, 500.0, 0.5, 2.32),
@@ -428,7 +428,7 @@ mod tests {
 
     /// Without prediction the simulation must agree with the eigenvalues.
     #[test]
-    fn the_radius_of_a_run_is_that_of_the_matrix() {
+    fn the_simulated_radius_agrees_with_the_eigenvalues() {
         for (dead, zeta) in [(0.2e-3, 0.5), (0.8e-3, 0.5), (1.6e-3, 0.5), (2.4e-3, 0.5), (0.3e-3, 0.1)] {
             let late = Late { dead, lag: lag_of(500.0) };
             let plain = contact(1.0, 1e5, 2.0 * zeta * f64::sqrt(1e5), 1e-3, late);
@@ -440,7 +440,7 @@ mod tests {
     /// The contact of the textbook: without the predictor it is unstable from 2.4 ms on, with it not before three times
     /// that.
     #[test]
-    fn looking_ahead_makes_a_late_contact_stable() {
+    fn prediction_stabilises_a_delayed_contact() {
         let late = Late { dead: 4.5e-3, lag: lag_of(500.0) };
         let plain = contact(1.0, 1e5, f64::sqrt(1e5), 1e-3, late);
         assert!(plain.radius() > 1.0);

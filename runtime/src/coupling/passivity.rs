@@ -140,7 +140,7 @@ mod tests {
     }
 
     #[test]
-    fn friction_that_only_takes_is_healthy() {
+    fn dissipative_friction_is_healthy() {
         let mut energy = Energy::new(1e-3, 1e-3);
         for k in 0..2000 {
             let v = (0.01 * f64::from(k)).sin();
@@ -150,12 +150,12 @@ mod tests {
     }
 
     #[test]
-    fn a_late_spring_is_noticed() {
+    fn a_delayed_spring_is_detected() {
         assert_eq!(swing(4, 0.2e-3), Sign::Trip);
     }
 
     #[test]
-    fn a_reversal_of_the_other_torque_is_allowed_its_share() {
+    fn a_reversal_of_the_other_torque_raises_the_allowance() {
         let mut energy = Energy::new(1e-3, 1e-3);
         energy.see(1.0, 1.0, 1.0);
         assert_eq!(energy.see(-1.0, 1.0, -1.0), Sign::Healthy, "one store given back at a reversal");

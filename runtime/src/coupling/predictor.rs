@@ -429,7 +429,7 @@ mod tests {
 
     /// Rms error of the friction in the stick-slip test, in % of F_C, over dead times. Figures of docs/prediction.md.
     #[test]
-    fn stick_slip_at_a_dead_time_of_2_ms_is_right_with_the_look_ahead() {
+    fn stick_slip_with_2_ms_of_dead_time_is_right_with_the_predictor() {
         let (ideal, slips) = pulled(Coupling::Ideal, 0);
         assert_eq!(slips, 2, "the contact itself slips twice in 20 s");
         let mut table = String::from("dead time  plain  exact speed  15 counts, unknown pull\n");
@@ -453,7 +453,7 @@ mod tests {
     }
 
     #[test]
-    fn what_nobody_told_is_found() {
+    fn an_unknown_torque_is_estimated() {
         let (inertia, count) = (0.012, 2.4e-5);
         let mut look = Lookahead::new(inertia, T_NS, count, vec![Torque::new(800_000, 0.6e-3)]);
         let (mut x, mut v) = (0.0f64, 0.0);

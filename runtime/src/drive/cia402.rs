@@ -821,7 +821,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_period_is_told_as_a_number_times_a_power_of_ten() {
+    fn a_period_is_encoded_as_a_number_times_a_power_of_ten() {
         assert_eq!(interpolation(1_000_000), Some((1, -3)));
         assert_eq!(interpolation(20_000_000), Some((20, -3)));
         assert_eq!(interpolation(250_000), Some((25, -5)));

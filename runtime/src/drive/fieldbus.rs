@@ -722,8 +722,8 @@ impl Fieldbus {
         }
     }
 
-    /// Handles a drive that does not obey a stop: either no frame reaches it, or its set-points alone do not. The stop is
-    /// commanded by NMT, and our heartbeat ends: the drive's own time-out, which the start-up has tested, stops it.
+    /// Handles a drive that does not obey a stop: either no frame reaches it, or its set-points alone do not. The stop
+    /// is commanded by NMT, and our heartbeat ends: the drive's own time-out, which the start-up has tested, stops it.
     fn insist(&mut self, now_ns: u64, lasted_ns: u64, send: Send) {
         if lasted_ns < OBEYS_NS || !is_present(Protection::Silence) {
             return;

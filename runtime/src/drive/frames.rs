@@ -161,7 +161,7 @@ mod tests {
     }
 
     #[test]
-    fn bits_lie_where_the_formats_say() {
+    fn bit_numbering_matches_the_formats() {
         let data = [0x12, 0x34, 0x56, 0x78, 0x9A, 0xBC, 0xDE, 0xF0];
         let unsigned = |start, bits, big| value(field(start, bits, big, Format::Unsigned), &data);
         assert_eq!(unsigned(0, 16, false), Some(f64::from(0x3412)));
@@ -197,7 +197,7 @@ mod tests {
     }
 
     #[test]
-    fn what_travels_is_never_greater_than_what_was_permitted() {
+    fn the_encoded_value_never_exceeds_the_permitted_one() {
         let mut random = Chance(5);
         for case in 0..50_000 {
             let (bits, format) = [
@@ -229,7 +229,7 @@ mod tests {
     }
 
     #[test]
-    fn neighbours_stay_and_values_are_clamped() {
+    fn neighbouring_bits_stay_and_values_are_clamped() {
         let mut data = [0; 8];
         write(&field(4, 8, false, Format::Signed), 1e9, &mut data);
         assert_eq!(data[..2], [0xF0, 0x07]);
@@ -241,7 +241,7 @@ mod tests {
     }
 
     #[test]
-    fn what_shares_bits_is_written_where_the_switch_says() {
+    fn fields_that_share_bits_are_written_according_to_their_multiplexer() {
         let byte = |k: u16| field(8 * k, 8, false, Format::Unsigned);
         let mut message = message(vec![byte(2), byte(1), byte(2), byte(0), byte(3)]);
         // Field 3 multiplexes 0 and 1; field 1 multiplexes 2 and 4.
@@ -274,7 +274,7 @@ mod tests {
 
     /// The plausibility check of readings handles NaN and infinity, in one place.
     #[test]
-    fn a_float_that_is_no_number_is_told_as_it_is() {
+    fn a_float_that_is_not_finite_is_decoded_unchanged() {
         let told = |number: f32| value(field(0, 32, false, Format::Float32), &number.to_bits().to_le_bytes()).unwrap();
         assert!(told(f32::NAN).is_nan());
         assert_eq!([f32::INFINITY, f32::NEG_INFINITY].map(told), [f64::INFINITY, f64::NEG_INFINITY]);

@@ -250,7 +250,7 @@ mod tests {
     }
 
     #[test]
-    fn a_right_shaft_passes_and_rests() {
+    fn a_correct_shaft_passes_and_stops() {
         for friction in [0.0, 0.1, 0.4] {
             let (verdict, x, w) = run(BOUNDS, friction, [1.0; 3]);
             assert_eq!(verdict, Verdict::Right, "friction {friction}");
@@ -259,7 +259,7 @@ mod tests {
     }
 
     #[test]
-    fn wrong_signs_and_scales_are_told() {
+    fn wrong_signs_and_scales_are_reported() {
         assert_eq!(run(BOUNDS, 0.1, [-1.0, 1.0, 1.0]).0, Verdict::Wrong(Why::WrongSign));
         assert_eq!(run(BOUNDS, 0.1, [1.0, -1.0, -1.0]).0, Verdict::Wrong(Why::WrongSign));
         for factor in [-1.0, 0.1, 10.0] {

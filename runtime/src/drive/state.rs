@@ -350,7 +350,7 @@ mod tests {
     }
 
     #[test]
-    fn a_status_word_shows_its_state_whatever_the_other_bits() {
+    fn the_state_depends_only_on_its_bits_of_the_status_word() {
         for state in STATES {
             for other in 0..=u16::MAX {
                 let status = state.bits() | other & !0x6F;
@@ -401,7 +401,7 @@ mod tests {
     }
 
     #[test]
-    fn transitions_take_their_time_and_can_be_taken_back() {
+    fn transitions_take_time_and_can_be_cancelled() {
         let times = Times { switch_on_ns: 10, enable_ns: 20, disable_ns: 5, start_ns: 100 };
         let mut machine = Machine::new(times, 0);
         assert!(!machine.advance(99) && machine.advance(100));

@@ -65,7 +65,7 @@ fn two_drives_start_up_in_order() {
 }
 
 #[test]
-fn nothing_makes_torque_before_the_first_motion() {
+fn no_drive_has_torque_before_the_polarity_check() {
     let mut table = table(&rig(Mode::Torque));
     table.until(Step::AwaitEnable);
     table.fieldbus.request(Request::Enable);
@@ -130,7 +130,7 @@ fn torque_mode_4_has_the_rigs_slope() {
 }
 
 #[test]
-fn speed_and_position_are_held() {
+fn speed_and_position_are_controlled() {
     let mut speed = rig(Mode::Speed);
     // Alone on the shaft, so that the other drive does not work against it.
     speed.nodes.remove(SERVO);
@@ -157,7 +157,7 @@ fn speed_and_position_are_held() {
 }
 
 #[test]
-fn wrong_drives_are_refused_in_words() {
+fn wrong_drives_are_refused_with_a_message() {
     let set = |index: u16, kind: Type, value: i64| {
         with(|bench| {
             let entry = Entry::number(Object(index, 0), "", kind, Access::ReadOnly, value).mapped();
@@ -220,7 +220,7 @@ fn wrong_drives_are_refused_in_words() {
 }
 
 #[test]
-fn a_map_that_reads_back_otherwise_is_refused() {
+fn a_mapping_with_a_wrong_read_back_is_refused() {
     // The simulation continues; the answer to one read-back is falsified on the bus.
     let mut table = table(&rig(Mode::Torque));
     table.until(Step::Configure);
@@ -279,7 +279,7 @@ fn wrong_signs_and_scales_are_refused() {
 }
 
 #[test]
-fn a_drive_that_ignores_our_silence_is_refused() {
+fn a_drive_that_ignores_our_missing_heartbeat_is_refused() {
     let mut table = table(&rig(Mode::Torque));
     table.until(Step::AwaitEnable);
     // Changed after the configuration: the read-back cannot detect it, but the time-out test does.
@@ -291,7 +291,7 @@ fn a_drive_that_ignores_our_silence_is_refused() {
 }
 
 #[test]
-fn another_master_is_refused_or_told() {
+fn another_master_is_refused_or_reported() {
     for (id, at_start) in [(0x080, true), (0x000, true), (0x603, true), (0x705, true), (0x204, true), (0x080, false)] {
         let mut table = table(&rig(Mode::Torque));
         if at_start {
@@ -332,7 +332,7 @@ fn after(text: &str) -> (Vec<(Option<usize>, TroubleKind)>, usize, Table) {
 }
 
 #[test]
-fn what_goes_wrong_is_heard_in_time() {
+fn faults_are_reported_in_time() {
     let emergency =
         |code, register| TroubleKind::Emergency(crate::canopen::service::Emergency { code, register, vendor: [0; 5] });
     let heard = |text: &str| {
@@ -364,7 +364,7 @@ fn what_goes_wrong_is_heard_in_time() {
 }
 
 #[test]
-fn a_master_that_dies_leaves_the_shaft_at_rest() {
+fn the_shaft_stops_when_the_master_dies() {
     let mut table = table(&rig(Mode::Torque));
     table.arm();
     table.commands[SERVO].1 = 1.0;
@@ -409,7 +409,7 @@ fn prepared_frames_stop_both_drives() {
 }
 
 #[test]
-fn a_device_is_read_and_told() {
+fn a_device_is_read_and_commanded() {
     let rig = rig(Mode::Torque);
     let mut table = table(&rig);
     table.bench.hook(fault_injection::read("panel.enable = 0 at 500 ms for 100 ms", &rig).unwrap());
@@ -476,7 +476,7 @@ fn a_simulated_vlt_has_its_scale_and_refresh() {
 }
 
 #[test]
-fn a_converter_of_the_fc302_kind_lives_by_guarding() {
+fn a_converter_of_the_fc302_kind_uses_node_guarding() {
     let mut rig = rig(Mode::Speed);
     rig.nodes.remove(SERVO);
     rig.outputs.truncate(1);
@@ -499,7 +499,7 @@ fn a_converter_of_the_fc302_kind_lives_by_guarding() {
 }
 
 #[test]
-fn hooks_are_read_or_refused_in_words() {
+fn hooks_are_parsed_or_refused_with_a_message() {
     let rig = rig(Mode::Torque);
     let read = |text: &str| fault_injection::read(text, &rig);
     let hook = read("servo encoder frozen when load.speed > 10 rad/s for 20 ms").unwrap();
@@ -571,7 +571,7 @@ fn two_drives_start_up_over_a_bus() {
 }
 
 #[test]
-fn a_drive_that_holds_speed_turns_the_other_for_its_test() {
+fn a_speed_drive_turns_a_torque_drive_for_its_polarity_check() {
     let mut rig = rig(Mode::Torque);
     config(&mut rig, SERVO).mode = Mode::Speed;
     rig.outputs[SERVO].signal.what = What::Speed;
@@ -584,7 +584,7 @@ fn a_drive_that_holds_speed_turns_the_other_for_its_test() {
 }
 
 #[test]
-fn the_first_motion_keeps_to_the_rigs_limit() {
+fn the_polarity_check_respects_the_limit_of_the_rig() {
     let mut rig = rig(Mode::Torque);
     (rig.outputs[LOAD].low, rig.outputs[LOAD].high) = (-0.1, 0.5);
     let mut table = table(&rig);

@@ -96,7 +96,7 @@ mod tests {
     use crate::rng::Chance;
 
     #[test]
-    fn torque_is_told_in_thousandths_of_rated_torque() {
+    fn torque_is_encoded_in_thousandths_of_rated_torque() {
         let torque = Scale::signed(4.0 / 1000.0, 16);
         assert_eq!(torque.number(2.0), 500);
         assert_eq!(torque.number(-0.0021), -1);
@@ -107,7 +107,7 @@ mod tests {
     }
 
     #[test]
-    fn a_position_goes_on_where_its_number_wraps() {
+    fn a_position_continues_beyond_its_overflow() {
         let mut counter = Counter::default();
         let mut truth = i64::from(i32::MAX) - 5;
         counter.read(truth as i32);
@@ -144,7 +144,7 @@ mod tests {
     }
 
     #[test]
-    fn a_command_on_the_wire_is_never_greater_than_what_is_permitted_and_never_a_step_less() {
+    fn an_encoded_command_is_within_one_step_below_the_permitted_value() {
         let mut random = Chance(11);
         for case in 0..100_000 {
             let step = 10f64.powf(random.between(-9.0, 3.0)) * [1.0, -1.0][random.below(2) as usize];

@@ -418,7 +418,7 @@ fn shrunk(script: &Script, why: String) -> (Script, String) {
 }
 
 #[test]
-fn a_shaft_that_is_not_as_told_and_a_contact_that_drives_are_noticed_in_time() {
+fn model_deviations_and_active_contacts_are_detected_in_time() {
     let number = |name: &str| std::env::var(name).ok().and_then(|text| text.parse::<u64>().ok());
     let seeds = number("FRIC_SEED").map_or(0..number("FRIC_RUNS").unwrap_or(RUNS), |seed| seed..seed + 1);
     let all = seeds.end - seeds.start;

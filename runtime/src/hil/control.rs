@@ -421,7 +421,7 @@ impl Control {
         }
         let computes = told.source == Source::Model && self.supervisor.is_armed();
         if !(computes && self.running) {
-            // The model is not running yet, so no output can jump.
+            // The model is not running, so no output can jump.
             told.set.iter().for_each(|(slot, value)| self.model.set(*slot, *value));
         }
         match told.source {
@@ -748,7 +748,7 @@ mod tests {
     }
 
     #[test]
-    fn a_missed_tick_is_made_up_for_and_too_many_stop_the_rig() {
+    fn missed_ticks_are_compensated_and_too_many_stop_the_rig() {
         let mut way = Way::new(|rig| rig.overrun = Overrun::Hold(2));
         way.set(What::Speed, 2.0);
         way.cycle(1, &[]);
@@ -762,7 +762,7 @@ mod tests {
     }
 
     #[test]
-    fn ticks_missed_again_and_again_stop_the_rig_and_cycles_in_time_make_good_for_them() {
+    fn repeated_missed_ticks_stop_the_rig_unless_cycles_in_time_compensate() {
         for most in 1..6 {
             let cause = |ticks: &mut dyn FnMut(u32) -> u32| {
                 let mut way = Way::new(|rig| rig.overrun = Overrun::Hold(most));
@@ -779,7 +779,7 @@ mod tests {
     }
 
     #[test]
-    fn a_reading_that_is_infinite_is_not_believed() {
+    fn an_infinite_reading_is_rejected() {
         for bad in [f64::INFINITY, f64::NEG_INFINITY, f64::NAN] {
             let mut way = Way::new(|_| ());
             way.set(What::Speed, 1.0);
@@ -826,7 +826,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_device_tells_is_a_number_or_the_one_before_and_three_that_are_none_stop_the_rig() {
+    fn values_that_are_not_finite_are_ignored_and_three_in_a_row_stop_the_rig() {
         let mut stopped = [0; 2];
         for seed in 0..500 {
             let mut chance = crate::rng::Chance(seed);
@@ -873,7 +873,7 @@ mod tests {
     }
 
     #[test]
-    fn a_reading_that_is_missing_is_held_and_then_lost() {
+    fn a_missing_reading_is_held_and_then_counts_as_lost() {
         let mut way = Way::new(|_| ());
         way.set(What::Speed, 1.0);
         way.cycle(1, &[]);
@@ -888,7 +888,7 @@ mod tests {
     }
 
     #[test]
-    fn a_glitch_is_not_believed_and_a_third_in_a_row_stops_the_rig() {
+    fn a_glitch_is_rejected_and_three_in_a_row_stop_the_rig() {
         let mut way = Way::new(|_| ());
         way.set(What::Speed, 1.0);
         let held = way.cycle(1, &[]);
@@ -933,14 +933,14 @@ mod tests {
     }
 
     #[test]
-    fn a_shaft_that_is_read_at_any_time_of_a_period_agrees_with_its_speed() {
+    fn position_and_speed_agree_for_any_reading_time_in_a_period() {
         for seed in 0..2000 {
             assert_eq!(read_at_any_time(seed, usize::MAX).0, None, "seed {seed}");
         }
     }
 
     #[test]
-    fn an_encoder_that_stands_still_is_found_at_whatever_time_it_is_read() {
+    fn a_frozen_encoder_is_detected_for_any_reading_time() {
         let (mut found, (.., most)) = (0, SHAFT);
         for seed in 0..2000 {
             let stands = 20 + seed as usize % 100;
@@ -956,7 +956,7 @@ mod tests {
     }
 
     #[test]
-    fn where_what_is_late_is_only_counted_a_second_of_odd_readings_is_borne() {
+    fn a_second_of_implausible_readings_is_tolerated_if_overruns_are_only_counted() {
         let mut way = Way::of(|_| (), Options { count_overruns: true, ..Options::default() });
         way.set(What::Speed, 1.0);
         way.cycle(1, &[]);
@@ -970,7 +970,7 @@ mod tests {
     }
 
     #[test]
-    fn a_set_of_parameters_makes_no_step_in_the_output() {
+    fn a_set_of_parameters_causes_no_step_in_the_output() {
         let mut way = Way::new(|_| ());
         way.set(What::Speed, 1.0);
         for _ in 0..10 {
@@ -991,7 +991,7 @@ mod tests {
     }
 
     #[test]
-    fn a_set_with_which_the_model_cannot_go_on_is_refused() {
+    fn a_set_with_which_the_model_cannot_continue_is_refused() {
         let mut way = Way::new(|_| ());
         way.set(What::Speed, 1.0);
         let first = way.cycle(1, &[]);
@@ -1002,7 +1002,7 @@ mod tests {
     }
 
     #[test]
-    fn what_the_model_cannot_compute_stops_the_rig() {
+    fn a_failure_of_the_model_stops_the_rig() {
         let mut way = Way::new(|_| ());
         way.set(What::Speed, 1.0);
         way.cycle(1, &[]);
@@ -1013,7 +1013,7 @@ mod tests {
     }
 
     #[test]
-    fn a_rig_without_bounds_is_refused_in_words() {
+    fn a_rig_without_bounds_is_refused_with_a_message() {
         let (mut rig, model) = rigs::rig();
         let Kind::Cia402(drive) = &mut rig.nodes[0].kind else { unreachable!() };
         drive.max_speed = None;

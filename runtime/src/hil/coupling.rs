@@ -292,7 +292,7 @@ mod tests {
     ];
 
     #[test]
-    fn the_store_of_a_bristle_is_found_by_turning_it() {
+    fn a_slow_motion_finds_the_store_of_a_bristle() {
         let (rig, model) = bristle();
         let coupling = Coupling::new(&rig, None, &WATCHED, &model);
         let stores: Vec<f64> = coupling.stores().collect();
@@ -301,13 +301,13 @@ mod tests {
     }
 
     #[test]
-    fn a_spring_without_end_is_no_contact() {
+    fn an_unlimited_spring_is_no_contact() {
         let (rig, model) = rigs::rig();
         assert_eq!(Coupling::new(&rig, None, &WATCHED, &model).stores().count(), 0);
     }
 
     #[test]
-    fn a_contact_that_drives_the_shaft_is_noticed_and_stops_where_it_shall() {
+    fn a_contact_that_drives_the_shaft_is_detected_and_stops_if_configured() {
         let (rig, model) = bristle();
         for stops in [false, true] {
             let mut coupling = Coupling::new(&rig, None, &WATCHED, &model);

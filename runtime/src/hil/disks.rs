@@ -366,7 +366,7 @@ fn shrunk(script: &Script, why: String) -> (Script, String) {
 }
 
 #[test]
-fn each_message_is_in_the_log_or_counted_whatever_its_disk_does() {
+fn each_message_is_logged_or_counted_for_any_disk_fault() {
     let number = |name: &str| std::env::var(name).ok().and_then(|text| text.parse::<u64>().ok());
     let seeds = number("FRIC_SEED").map_or(0..number("FRIC_RUNS").unwrap_or(RUNS), |seed| seed..seed + 1);
     let all = seeds.end - seeds.start;

@@ -254,7 +254,7 @@ mod tests {
     static TESTS: Mutex<()> = Mutex::new(());
 
     #[test]
-    fn a_watchdog_bites_when_cycles_stop_and_not_before() {
+    fn the_watchdog_acts_when_cycles_stop_and_not_before() {
         let bites = Arc::new(AtomicU32::new(0));
         let count = bites.clone();
         let stop = move || {
@@ -295,7 +295,7 @@ mod tests {
 
     /// A rig that is replaced closes its buses, and another file receives the number of their descriptor.
     #[test]
-    fn a_table_is_taken_back_before_its_descriptors_close() {
+    fn a_table_is_withdrawn_before_its_descriptors_close() {
         let _serial = TESTS.lock();
         let folder = tempfile::tempdir().unwrap();
         let path = |name: &str| folder.path().join(name);
@@ -326,7 +326,7 @@ mod tests {
     }
 
     #[test]
-    fn a_watchdog_bites_at_its_time_whenever_it_looked_last() {
+    fn the_watchdog_acts_at_its_time_out_whenever_it_checked_last() {
         let patience = 5_000_000;
         for beat in 1..50_000u64 {
             let beat_ns = beat * 997;

@@ -226,7 +226,7 @@ mod tests {
     }
 
     #[test]
-    fn no_dead_time_and_no_lag_up_to_those_of_the_text_is_taken_for_not_following() {
+    fn dead_times_and_lags_up_to_the_declared_ones_count_as_following() {
         for seed in 0..300 {
             let mut random = Chance(seed);
             let text = (random.between(0.0, 6.0), random.between(0.0, 5.0));
@@ -237,7 +237,7 @@ mod tests {
     }
 
     #[test]
-    fn a_drive_that_keeps_an_old_torque_is_found_in_time() {
+    fn a_drive_that_keeps_an_old_torque_is_detected_in_time() {
         let mut found = 0;
         for seed in 0..300 {
             let mut random = Chance(seed);

@@ -262,7 +262,7 @@ mod tests {
     use crate::testing::rigs;
 
     #[test]
-    fn what_is_measured_on_simulated_drives_is_what_they_are() {
+    fn identification_finds_the_values_of_simulated_drives() {
         let (mut rig, _, plant) = rigs::pair();
         for (node, delay, lag) in [(0, 0.8e-3, 0.6e-3), (1, 1.5e-3, 0.5e-3)] {
             (rig.nodes[node].delay, rig.nodes[node].lag) = (delay, lag);
@@ -286,7 +286,7 @@ mod tests {
     }
 
     #[test]
-    fn a_rig_without_torque_is_refused() {
+    fn a_rig_without_torque_drives_is_refused() {
         let (mut rig, _, _) = rigs::pair();
         for node in &mut rig.nodes {
             if let Kind::Cia402(drive) = &mut node.kind {

@@ -59,7 +59,7 @@ impl Stand {
 
 /// `FRIC_RUNS` sets the number of seeds; `FRIC_SEED` repeats one.
 #[test]
-fn whatever_is_said_however_fast_is_answered_once_and_the_model_has_what_was_taken() {
+fn each_command_is_answered_once_and_accepted_sets_act() {
     let number = |name: &str| std::env::var(name).ok().and_then(|text| text.parse::<u64>().ok());
     let runs = number("FRIC_RUNS").unwrap_or(30);
     let mut counts: HashMap<&str, u64> = HashMap::new();
@@ -144,7 +144,7 @@ fn whatever_is_said_however_fast_is_answered_once_and_the_model_has_what_was_tak
 }
 
 #[test]
-fn a_stop_acts_at_once_however_much_waits() {
+fn a_stop_acts_at_once_regardless_of_waiting_commands() {
     let mut stand = Stand::new(true);
     stand.reach(Step::Armed);
     let set = stand.set(&[(0, 0.5)]);
@@ -165,7 +165,7 @@ fn a_stop_acts_at_once_however_much_waits() {
 }
 
 #[test]
-fn what_was_asked_for_long_ago_is_refused_but_a_stop() {
+fn old_commands_are_refused_except_a_stop() {
     let mut stand = Stand::new(false);
     stand.reach(Step::AwaitEnable);
     let old = Stamp::Rig(0);
@@ -192,7 +192,7 @@ fn what_was_asked_for_long_ago_is_refused_but_a_stop() {
 }
 
 #[test]
-fn a_set_while_the_rig_is_stopped_or_waits_is_taken() {
+fn a_set_is_accepted_while_the_rig_is_stopped_or_waits() {
     let mut stand = Stand::new(false);
     stand.reach(Step::AwaitEnable);
     let waits = stand.set(&[(0, 0.7)]);
@@ -210,7 +210,7 @@ fn a_set_while_the_rig_is_stopped_or_waits_is_taken() {
 }
 
 #[test]
-fn without_a_judge_no_parameter_changes_and_after_the_end_that_is_said() {
+fn without_a_judge_every_set_is_refused_and_after_the_end_every_command() {
     let (rig, model, plant) = rigs::pair();
     let mut world = World::new(&rig, Some(plant), Pace::Fast, 1).unwrap();
     let slot = model.description().layout.params.slot(0);

@@ -283,7 +283,7 @@ fn judge_early(bites: &[u64], cycles: &[Seen], script: &Script) -> Result<Shown,
 }
 
 #[test]
-fn a_cycle_that_does_not_end_is_stopped_by_the_watchdog_in_its_time_and_no_other() {
+fn the_watchdog_stops_a_stalled_cycle_in_time_and_no_other() {
     let number = |name: &str| std::env::var(name).ok().and_then(|text| text.parse::<u64>().ok());
     let seeds = number("FRIC_SEED").map_or(0..number("FRIC_RUNS").unwrap_or(RUNS), |seed| seed..seed + 1);
     let all = seeds.end - seeds.start;

@@ -98,7 +98,7 @@ fn a_log_replays_to_the_bit_and_names_what_differs() {
 }
 
 #[test]
-fn a_rig_that_looks_ahead_replays_to_the_bit_from_any_state_of_its_log() {
+fn a_rig_with_a_predictor_replays_to_the_bit_from_any_state_of_its_log() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("ahead.friclog");
     let (end, hil, _) = run_of(looking_ahead(), 3.0, Some(&path));
@@ -140,7 +140,7 @@ fn two_equal_runs_leave_equal_logs() {
 }
 
 #[test]
-fn a_rig_whose_drives_are_not_there_is_refused() {
+fn a_rig_with_missing_drives_is_refused() {
     let (rig, model, plant) = rigs::pair();
     let mut world = World::new(&rig, Some(plant), Pace::Fast, 1).unwrap();
     world.bus(0).unplug(super::simulated::BENCH, 0, u64::MAX);

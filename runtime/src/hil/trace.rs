@@ -338,7 +338,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_cycle_comes_back() {
+    fn a_cycle_survives_encoding_and_decoding() {
         let shape = Shape { signals: 5, outputs: 2, drives: 2, recorded: 3 };
         let cycle = Cycle {
             k: 7,
@@ -372,7 +372,7 @@ mod tests {
     }
 
     #[test]
-    fn frames_come_back() {
+    fn frames_survive_encoding_and_decoding() {
         let frames = [
             Frame::new(0x80, &[]),
             Frame::new(0x7ff, &[1, 2, 3, 4, 5, 6, 7, 8]),
@@ -390,7 +390,7 @@ mod tests {
     }
 
     #[test]
-    fn settings_come_back() {
+    fn settings_survive_encoding_and_decoding() {
         let bounds = [Bounds { torque: Some(4.0), speed: None }, Bounds::default()];
         let options = Options { count_overruns: true, energy_stops: true, ramp_ns: 5, ..Options::default() };
         let bytes = settings_to_bytes(&bounds, &options);

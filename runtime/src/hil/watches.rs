@@ -280,7 +280,7 @@ mod tests {
     }
 
     #[test]
-    fn a_drive_described_by_frames_is_watched_by_what_it_tells() {
+    fn a_drive_described_by_frames_is_supervised_by_its_signals() {
         // The spring: −10 N·m/rad times the integrated speed.
         assert_eq!(stopped(|_, sent| [0.1, 0.0, sent]), None);
         assert_eq!(stopped(|k, sent| [if k < 5 { 0.0 } else { -10.1 }, 0.0, sent]), Some((Cause::Speed(0, -10.1), 5)));
@@ -293,7 +293,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_watched_is_said() {
+    fn missing_checks_are_reported() {
         let said = |tells: &[(&str, &str)], within| lacking(&framed(tells, within).0).join("; ");
         assert_eq!(said(&ALL, WITHIN), "drive `load` is not watched for its state (frames have no status word)");
         let power = Within { max_power: None, ..WITHIN };

@@ -288,7 +288,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_written_is_read_and_equal_content_gives_equal_bytes() {
+    fn a_package_survives_encoding_and_equal_content_gives_equal_bytes() {
         let bytes = package().to_bytes();
         assert_eq!(Package::read(&bytes), Ok(package()));
         assert_eq!(bytes, package().to_bytes());
@@ -311,7 +311,7 @@ mod tests {
     }
 
     #[test]
-    fn no_beginning_of_a_package_is_one_nor_is_anything_longer() {
+    fn a_truncated_or_extended_package_is_refused() {
         let bytes = package().to_bytes();
         for length in 0..bytes.len() {
             assert!(Package::read(&bytes[..length]).is_err(), "{length} bytes");
@@ -323,7 +323,7 @@ mod tests {
 
     /// With a right hash, invalid content is a different error.
     #[test]
-    fn a_table_that_lies_is_refused() {
+    fn an_inconsistent_table_is_refused() {
         let mut bytes = package().to_bytes();
         let rehash = |bytes: &mut Vec<u8>| {
             bytes[HASH].fill(0);
@@ -343,7 +343,7 @@ mod tests {
 
     /// The name of a package becomes part of a file name, and its texts are displayed.
     #[test]
-    fn names_that_leave_a_folder_or_act_on_a_terminal_are_refused() {
+    fn names_that_escape_a_folder_or_control_a_terminal_are_refused() {
         let why = |package: &Package| Package::read(&package.to_bytes()).unwrap_err().to_string();
         for rig in ["", "../../x", "/etc/x", "a\u{1b}[2J", ".x", "-x"] {
             let told = why(&Package { rig: rig.into(), ..package() });
@@ -360,7 +360,7 @@ mod tests {
     }
 
     #[test]
-    fn another_target_or_maker_is_refused_in_words() {
+    fn another_target_or_maker_is_refused_with_a_message() {
         let package = package();
         assert_eq!(package.fits("1.2.3"), Ok(()));
         let why = package.fits("2.0.0").unwrap_err().to_string();

@@ -150,7 +150,7 @@ mod tests {
     }
 
     #[test]
-    fn of_nothing_all_is_zero() {
+    fn all_values_of_an_empty_histogram_are_zero() {
         let none = Histogram::new();
         assert_eq!((none.quantile_ns(0.5), none.min_ns(), none.mean_ns(), none.max_ns()), (0, 0, 0, 0));
     }

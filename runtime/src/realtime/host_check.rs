@@ -208,7 +208,7 @@ mod tests {
     }
 
     #[test]
-    fn a_machine_made_for_it_is_good() {
+    fn a_prepared_machine_is_good() {
         let (_root, host) = machine(&[
             ("proc/sys/kernel/osrelease", "6.1.0-rt\n"),
             ("sys/kernel/realtime", "1\n"),
@@ -230,7 +230,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_lacking_comes_with_its_line() {
+    fn a_problem_is_reported_with_its_remedy() {
         let limits = "Limit                     Soft Limit           Hard Limit           Units\n\
                       Max locked memory         8388608              8388608              bytes\n\
                       Max realtime priority     0                    0\n";
@@ -261,7 +261,7 @@ mod tests {
     }
 
     #[test]
-    fn an_interrupt_stands_above_the_loop() {
+    fn the_priority_of_an_interrupt_thread_must_exceed_the_loop() {
         let stat = |priority| format!("312 (irq/27-can0) S 2 {}{priority} 1 0\n", "0 ".repeat(35));
         let low = stat(50);
         let (_root, host) = machine(&[("proc/312/comm", "irq/27-can0\n"), ("proc/312/stat", &low)]);

@@ -230,7 +230,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_refused_is_told_with_its_remedy() {
+    fn refusals_are_reported_with_their_remedy() {
         // In a thread of its own, so that granted wishes end with it.
         let refused = std::thread::spawn(|| {
             let wishes = Wishes { priority: 1000, core: Some(100_000), memory: false, awake: false };
@@ -247,7 +247,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_granted_is_given_back() {
+    fn granted_wishes_are_released() {
         std::thread::spawn(|| {
             // SAFETY: takes no pointers; 0 is the calling thread.
             let policy = || unsafe { libc::sched_getscheduler(0) } & !libc::SCHED_RESET_ON_FORK;

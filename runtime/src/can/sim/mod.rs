@@ -4,7 +4,7 @@
 //! the same seed. Knows no drive: a participant is an [`Actor`].
 //!
 //! ```text
-//! let simulation = Simulation::new();               // or Simulation::real_time(): the same, paced by the machine's clock
+//! let simulation = Simulation::new();               // or Simulation::real_time(), paced by the machine's clock
 //! let bus = simulation.bus("bench", 1_000_000);     // created at the first call, found at the next
 //! let mut master = bus.port("master");              // a `Bus`
 //! simulation.attend(Box::new(Drive::new(bus.port("load"))));

@@ -85,7 +85,7 @@ fn a_node_alone_goes_passive_and_no_further() {
 }
 
 #[test]
-fn touching_wires_lead_to_bus_off_and_only_a_request_leads_back() {
+fn a_short_circuit_causes_bus_off_until_a_restart() {
     let (simulation, bus, mut a, mut b) = pair();
     bus.short(0, 20_000_000);
     a.send(Frame::new(1, &[])).expect("sent");
@@ -115,7 +115,7 @@ fn another_bit_rate_is_an_error_on_both_sides() {
 }
 
 #[test]
-fn a_disturbed_frame_is_counted_and_comes_again() {
+fn a_disturbed_frame_is_counted_and_retransmitted() {
     let (simulation, bus, mut a, mut b) = pair();
     bus.plant("a", Fault::new(Kind::Disturb).times(3));
     a.send(Frame::new(1, &[7])).expect("sent");
@@ -158,7 +158,7 @@ fn planted_faults_do_what_they_say() {
 }
 
 #[test]
-fn an_overrun_is_told_and_counted() {
+fn an_overrun_is_reported_and_counted() {
     let (simulation, bus, mut a, mut b) = pair();
     bus.plant("b", Fault::new(Kind::Overrun).times(2));
     for k in 0..3 {
@@ -182,7 +182,7 @@ fn a_babbling_node_starves_the_others() {
 }
 
 #[test]
-fn an_unplugged_node_hears_nothing_and_is_not_heard() {
+fn an_unplugged_node_neither_receives_nor_is_received() {
     let (simulation, bus, mut a, mut b) = pair();
     let mut c = bus.port("c");
     bus.unplug("c", 1_000, 5_000_000);
@@ -245,7 +245,7 @@ fn an_actor_answers_while_the_master_waits() {
 }
 
 #[test]
-fn real_time_moves_by_itself() {
+fn real_time_advances_by_itself() {
     let simulation = Simulation::real_time();
     let bus = simulation.bus("bench", RATE);
     let (mut a, mut b) = (bus.port("a"), bus.port("b"));

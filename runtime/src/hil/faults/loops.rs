@@ -233,7 +233,7 @@ fn shrunk(script: &Script, why: String) -> (Script, String) {
 }
 
 #[test]
-fn a_speed_or_position_that_no_set_point_explains_stops_the_rig_within_a_second() {
+fn an_unexplained_speed_or_position_stops_the_rig_within_a_second() {
     let (first, runs) = match super::number("FRIC_SEED") {
         Some(seed) => (seed, 1),
         None => (super::number("FRIC_FIRST").unwrap_or(0), super::number("FRIC_RUNS").unwrap_or(RUNS)),
