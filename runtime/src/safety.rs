@@ -82,11 +82,11 @@ pub enum Cause {
     Speed(usize, f64),
     /// A drive is outside its travel, rad.
     Travel(usize, f64),
-    /// The shaft accelerates against the applied torque (a sign is wrong); the drive whose speed rose most.
+    /// The shaft accelerates against the applied torque (a sign is wrong); a drive whose speed rose too far.
     RunAway(usize),
     /// A signal was missing for too long; its index among the signals read.
     Lost(usize),
-    /// A signal was not credible for too long.
+    /// A signal was implausible for too long.
     Implausible(usize),
     /// A drive reports another mode of operation than requested, or does not follow its commands.
     NotFollowing(usize),

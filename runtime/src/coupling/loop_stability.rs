@@ -2,11 +2,11 @@
 //!
 //! In: the step of the control program as matrices, the shaft as matrices, dead time and lag of each drive. Out: the
 //! spectral radius over one period, and the dead time at which it exceeds 1. The linearisation is the only
-//! approximation: the shaft and the lags are integrated exactly between the times at which commands act (Åström,
-//! Wittenmark, *Computer-Controlled Systems*, 3.2).
+//! approximation: the shaft and the lags are integrated exactly between the times at which commands act (sampling of
+//! systems with time delay: Åström, Wittenmark, *Computer-Controlled Systems*, 1997).
 //!
-//! A dead time n T + r is a queue of n + 1 set-points; within one period the older of the last two acts for r, the
-//! newer for the rest. Eigenvalues at 1 are free rotations and constants of the program; they are ignored.
+//! A dead time n T + r is a queue of n + 1 set-points; within one period the oldest one acts for r, the next one for
+//! the rest. Eigenvalues at 1 are free rotations and constants of the program; they are ignored.
 //!
 //! A loop with a predictor ([`Ahead`]) is simulated instead, including the observer, from a small deflection: the rate
 //! at which it decays or grows is its radius.

@@ -1,5 +1,5 @@
-//! Predictor: the speed of the shaft at the time when the torque acts that is computed now (a disturbance observer with
-//! prediction over the dead time, as in a Smith predictor).
+//! Predictor: the speed of the shaft at the time when the torque acts that is computed now (an observer with a
+//! disturbance state, and a prediction of the state over the dead time).
 //!
 //! In: measured positions, the commands sent and their times of action, the inertia. Out: speed and position at the
 //! centre of the coming torque, ahead by H = dead time + T/2 + lag. An observer of the shaft knows the commands that
