@@ -16,6 +16,7 @@ use crate::numerics::{autodiff, fixed_step, rosenbrock};
 use crate::opt::{self, Context};
 use abi::lanes::Lanes;
 use abi::plan::Method;
+use abi::rosenbrock::layout::Trial;
 use abi::table::{Code, Interpret, Machine};
 use abi::{Description, Function, Layout};
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -133,6 +134,10 @@ const MAX_TIERED_OPS: usize = 5_000;
 /// compiling it some 2 µs.
 const TIER_UP_CALLS: u64 = 200;
 
+/// The same for attempts at an adaptive step. Compiling its long function takes some 13 ms, because the time of register
+/// allocation grows faster than the length, and interpreting it some 17 µs.
+const TIER_UP_ATTEMPTS: u64 = 800;
+
 /// The functions of a program, each in the tier it has reached.
 struct Tiered {
     program: Program,
@@ -160,6 +165,12 @@ impl Tiered {
         self.forms[which as usize].func.get_or_init(make).as_ref()
     }
 
+    /// Number of attempts at adaptive steps that the function has settled by itself so far: accepted or rejected.
+    fn settled(&self, which: Function, block: &[f64]) -> u64 {
+        let trial = Trial::of(&self.program.description.layout).filter(|_| which == Function::Rosenbrock);
+        trial.map_or(0, |trial| (block[trial.accepted().index()] + block[trial.refused().index()]) as u64)
+    }
+
     /// Passes one function to a back end.
     fn make<T>(&self, which: Function, back_end: impl FnOnce(&[(Function, Func)], &Layout, usize) -> T) -> T {
         let func = self.func(which).unwrap_or_else(|| panic!("the code has no function `{}`", which.name()));
@@ -172,14 +183,25 @@ impl Interpret for Tiered {
         let forms = &self.forms[which as usize];
         let make = |funcs: &[_], layout: &Layout, pool| jit::compile_prepared(funcs, layout, pool).ok().map(|it| it.0);
         let compiled = || self.make(which, make);
-        let pays = || forms.runs.fetch_add(count, Ordering::Relaxed).saturating_add(count) > TIER_UP_CALLS;
+        // A call for adaptive steps ends at the first step that it leaves open, most often long before `count`.
+        let (least, pays_after) = match which {
+            Function::Rosenbrock => (1, TIER_UP_ATTEMPTS),
+            _ => (count, TIER_UP_CALLS),
+        };
+        let pays = || forms.runs.load(Ordering::Relaxed).saturating_add(least) > pays_after;
         if !self.interpret
             && (forms.machine.get().is_some() || pays())
             && let Some(machine) = forms.machine.get_or_init(compiled)
         {
             return machine.call(which, block, pool, count);
         }
-        forms.interpreter.get_or_init(|| self.make(which, Interpreter::new)).call(which, block, pool, count)
+        let settled = |block: &[f64]| self.settled(which, block);
+        let before = settled(block);
+        let status =
+            forms.interpreter.get_or_init(|| self.make(which, Interpreter::new)).call(which, block, pool, count);
+        let runs = least.saturating_add(settled(block).saturating_sub(before));
+        forms.runs.fetch_add(runs, Ordering::Relaxed);
+        status
     }
 
     fn made(&self, which: Function) -> Option<&Machine> {

@@ -31,7 +31,7 @@ const LEAST_TOL: f64 = 1e-13;
 
 /// Tolerances of the adaptive runs that fixed steps are compared with, and the factors by which their longest step is
 /// shorter. Where the longest step limits all steps, two runs with the same limit would agree whatever their tolerance.
-const REFERENCES: [(f64, f64); 2] = [(1e-8, 1.0), (1e-10, 4.0)];
+const REFERENCES: [(f64, f64); 2] = [(1e-7, 1.0), (1e-9, 2.0)];
 
 /// Limit on progress callbacks of such a run: so many for each fixed step, plus a constant. The run makes one every few
 /// dozen steps, so this limits its cost.
