@@ -6,6 +6,7 @@
 
 pub mod scc;
 pub mod print;
+pub mod parse;
 pub mod verify;
 pub mod eval;
 pub mod build;

@@ -7,6 +7,9 @@
 //!   v2 = mul v0 v1
 //!   store 4 = v2
 //! ```
+//!
+//! The listing is exact: [`parse`](super::parse::parse) reads it back. Reals have as many digits as identify them; a NaN
+//! other than `f64::NAN` shows its bits.
 
 use super::{Binary, Func, Op, Unary, Value, Write};
 use std::fmt;
@@ -20,7 +23,10 @@ impl fmt::Display for Value {
 impl fmt::Display for Op {
     fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
         match *self {
-            Op::Real(bits) => write!(f, "{:?}", f64::from_bits(bits)),
+            Op::Real(bits) => match f64::from_bits(bits) {
+                number if number.is_nan() && bits != f64::NAN.to_bits() => write!(f, "NaN {bits:#x}"),
+                number => write!(f, "{number:?}"),
+            },
             Op::Int(n) => write!(f, "int {n}"),
             Op::Bool(b) => write!(f, "{b}"),
             Op::Load(slot) => write!(f, "load {}", slot.0),
