@@ -29,7 +29,7 @@ mod reroll;
 mod outline;
 mod emit_outlined;
 mod emit_f64x2;
-mod hoist_params;
+pub mod hoist_params;
 pub mod target;
 mod executable_memory;
 pub mod lanes;

@@ -30,6 +30,13 @@ pub struct Late {
     effect: fn(&Func, &Layout) -> Option<String>,
 }
 
+impl Late {
+    /// What it does with a step, in words. The step is expanded.
+    pub fn effect(&self, func: &Func, layout: &Layout) -> String {
+        (self.effect)(func, layout).unwrap_or_else(|| "nothing to do".into())
+    }
+}
+
 /// The passes of code generation, in order.
 pub static LATE: [Late; 7] = [
     Late {
@@ -143,13 +150,7 @@ pub fn each(program: &Program, method: Method, ran: &mut dyn FnMut(Ran)) {
     ran(plain("expand", does, func.ops.len(), expanded.ops.len()));
     let expanded = if method == Method::Adaptive { numerics::rosenbrock::pooled(&expanded) } else { expanded };
     for pass in &LATE {
-        let effect = (pass.effect)(&expanded, &program.description.layout);
-        let ops = [expanded.ops.len(); 2];
-        ran(Ran {
-            name: pass.name,
-            does: pass.does,
-            ops,
-            effect: Some(effect.unwrap_or_else(|| "nothing to do".into())),
-        });
+        let effect = Some(pass.effect(&expanded, &program.description.layout));
+        ran(Ran { name: pass.name, does: pass.does, ops: [expanded.ops.len(); 2], effect });
     }
 }

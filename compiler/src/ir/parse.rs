@@ -1,8 +1,8 @@
 //! Parser: reads the listing of a function, as [`print`](super::print) writes it.
 //!
 //! In: the text of one function. Out: the function, bit by bit the one that was printed, or the first error with its
-//! line. Blank lines are ignored, and so is the rest of a line from `;` on. The parser checks the form of the text only:
-//! whether values exist and types match is for [`verify`](super::verify) to say.
+//! line. Blank lines and comments, from `;` to the end of a line, are ignored. The parser checks the form of the text only;
+//! [`verify`](super::verify) checks that values exist and types match.
 
 use super::{Binary, Func, Op, Unary, Value, Write};
 use abi::Slot;
@@ -29,7 +29,7 @@ impl fmt::Display for ParseError {
 /// Parses the listing of one function.
 ///
 /// # Errors
-/// The first line that has not the form of a listing.
+/// The first line that is not of this form.
 pub fn parse(text: &str) -> Result<Func, ParseError> {
     let code = |line: &str| line.split(';').next().is_some_and(|code| !code.trim().is_empty());
     let mut lines = text.lines().zip(1..).filter(|(line, _)| code(line));
@@ -59,7 +59,8 @@ enum Section {
     Status,
 }
 
-/// The operations that have a name, under it; their operands stand for any. The names are those of the printer.
+/// The operations that have a name, under it; their operands are placeholders. The names are those of the printer.
+/// A new operation needs a line here.
 static NAMED: LazyLock<HashMap<String, Op>> = LazyLock::new(|| {
     let v = Value(0);
     let arithmetic = [
@@ -102,7 +103,7 @@ static NAMED: LazyLock<HashMap<String, Op>> = LazyLock::new(|| {
     arithmetic.into_iter().chain(elementary).map(|op| (name(&op), op)).collect()
 });
 
-/// The tokens of one line that are still to be read: words and single other characters.
+/// The unread rest of a line. Its tokens are words and single other characters.
 struct Line<'t> {
     rest: &'t str,
 }
@@ -126,13 +127,13 @@ impl<'t> Line<'t> {
 
     fn expect(&mut self, expected: &str) -> Result<(), String> {
         let token = self.token();
-        if token == expected { Ok(()) } else { Err(not(&format!("`{expected}`"), token)) }
+        if token == expected { Ok(()) } else { Err(unexpected(&format!("`{expected}`"), token)) }
     }
 
-    /// A number without a sign, except for an `i64`, which may have one.
+    /// An integer; `kind` names it in messages.
     fn number<T: FromStr>(&mut self, kind: &str) -> Result<T, String> {
         let token = self.token();
-        token.parse().ok().filter(|_| !token.starts_with('+')).ok_or_else(|| not(kind, token))
+        token.parse().ok().filter(|_| !token.starts_with('+')).ok_or_else(|| unexpected(kind, token))
     }
 
     fn slot(&mut self) -> Result<Slot, String> {
@@ -141,7 +142,7 @@ impl<'t> Line<'t> {
 
     fn value(&mut self) -> Result<Value, String> {
         let token = self.token();
-        value(token).ok_or_else(|| not("a value", token))
+        value(token).ok_or_else(|| unexpected("a value", token))
     }
 
     /// `BASE[INDEX < LEN]`, of a table or a ring.
@@ -158,7 +159,7 @@ impl<'t> Line<'t> {
     fn end(&mut self) -> Result<(), String> {
         match self.token() {
             "" => Ok(()),
-            token => Err(not("the end of the line", token)),
+            token => Err(unexpected("the end of the line", token)),
         }
     }
 
@@ -179,7 +180,7 @@ impl<'t> Line<'t> {
             Section::Operations => {
                 let next = Value(func.ops.len() as u32);
                 if value(first) != Some(next) {
-                    return Err(not(&format!("`{next}`, `store`, `write` or `status`"), first));
+                    return Err(unexpected(&format!("`{next}`, `store`, `write` or `status`"), first));
                 }
                 self.expect("=")?;
                 func.ops.push(self.op()?);
@@ -218,7 +219,7 @@ impl<'t> Line<'t> {
             word if let Some(op) = NAMED.get(word) => self.operands(*op)?,
             word => match word.parse::<f64>() {
                 Ok(number) if !number.is_nan() => Op::Real(number.to_bits()),
-                _ => return Err(not("an operation or a number", word)),
+                _ => return Err(unexpected("an operation or a number", word)),
             },
         })
     }
@@ -244,7 +245,7 @@ impl<'t> Line<'t> {
         })
     }
 
-    /// The bits of a NaN: those that follow in hexadecimal, or the usual ones.
+    /// The bits of a NaN: those that follow in hexadecimal, else those of `f64::NAN`.
     fn nan(&mut self) -> Result<u64, String> {
         let bits = match self.token() {
             "" => return Ok(f64::NAN.to_bits()),
@@ -261,7 +262,7 @@ fn value(token: &str) -> Option<Value> {
 }
 
 /// The message that something else was expected.
-fn not(expected: &str, token: &str) -> String {
+fn unexpected(expected: &str, token: &str) -> String {
     match token {
         "" => format!("expected {expected}, but the line ends"),
         token => format!("expected {expected}, not `{token}`"),
@@ -292,7 +293,7 @@ mod tests {
         func
     }
 
-    /// Mutants tried by hand: the printer shows NaN without bits, reals with 15 digits, the slots of a ring exchanged.
+    /// Mutants tried by hand: the printer shows NaN without bits, reals with 15 digits, a ring from its second slot.
     #[test]
     fn a_printed_function_is_read_back_to_the_bit() {
         for seed in 0..2000 {

@@ -36,7 +36,8 @@ pub struct Pass {
     pub name: &'static str,
     /// What it does, in one sentence.
     pub does: &'static str,
-    run: fn(&Func, Context) -> Func,
+    /// The pass.
+    pub run: fn(&Func, Context) -> Func,
 }
 
 /// The passes, in the order in which they run.
