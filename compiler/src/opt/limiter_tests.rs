@@ -97,52 +97,17 @@ fn is_share_of_step(build: &Build, value: Value) -> bool {
 mod tests {
     use super::*;
     use crate::ir::interpret::Interpreter;
+    use crate::ir::parse::parse;
     use crate::ir::random::Random;
     use abi::table::Interpret;
     use abi::{Function, Layout};
 
-    /// An integrator in slot 4 of the rate in slot 3, with the limit 1. With `twice`, the limit is tested at the
-    /// beginning of the step and at its midpoint, otherwise only at the midpoint.
-    fn integrator(twice: bool) -> Func {
-        let mut build = Build::new("step");
-        let (rate, x, h) = (build.load(Slot(3)), build.load(Slot(4)), build.load(Slot::STEP));
-        let [zero, half, limit] = [0.0, 0.5, 1.0].map(|number| build.real(number));
-        let share = build.mul(h, half);
-        let ask = |build: &mut Build, x| Beyond { limit, or_at: true, x, rate }.build(build);
-        let mut chosen = rate;
-        if twice {
-            let first = ask(&mut build, x);
-            chosen = build.select(first, zero, rate);
-        }
-        let middle = build.fma(share, chosen, x);
-        let second = ask(&mut build, middle);
-        let moved = build.fma(h, rate, x);
-        let next = build.select(second, x, moved);
-        build.store(Slot(4), next);
-        build.finish()
-    }
-
-    #[test]
-    fn a_limit_is_tested_once() {
-        assert_eq!(drop_limiter_tests(&integrator(true)), integrator(false));
-        assert_eq!(drop_limiter_tests(&integrator(false)), integrator(false), "nothing else changes");
-    }
-
-    #[test]
-    fn a_test_of_another_rate_is_unchanged() {
-        let mut func = integrator(true);
-        // The select now returns 0 or a value that is not the rate.
-        let other = func.ops.iter().position(|op| matches!(op, Op::Load(Slot::STEP))).expect("it has a step");
-        let chosen = func.ops.iter_mut().find(|op| matches!(op, Op::Select(..))).expect("it chooses");
-        let Op::Select(when, zero, _) = *chosen else { unreachable!() };
-        *chosen = Op::Select(when, zero, Value(other as u32));
-        assert_eq!(drop_limiter_tests(&func).ops.len(), func.ops.len());
-    }
-
     #[test]
     fn results_agree_to_the_bit() {
         let layout = Layout::new([0, 1, 1, 0, 0, 0, 0, 0, 0, 0]);
-        let [twice, once] = [integrator(true), drop_limiter_tests(&integrator(true))]
+        let file = include_str!("../../../tests/ir/limiter_tests_middle.ir");
+        let func = parse(file.split("\n---\n").next().expect("the input")).expect("a listing");
+        let [twice, once] = [func.clone(), drop_limiter_tests(&func)]
             .map(|func| Interpreter::new(&[(Function::Step, func)], &layout, 0));
         let mut random = Random(1);
         let mut stopped = 0;

@@ -330,69 +330,6 @@ mod tests {
         build.finish()
     }
 
-    #[track_caller]
-    fn check(func: &Func, expected: &str) {
-        let listing = reassociate(func, false).to_string();
-        let found: Vec<&str> = listing.lines().skip(1).map(str::trim).collect();
-        assert_eq!(found.join("; "), expected);
-    }
-
-    #[test]
-    fn an_invariant_divisor_becomes_a_factor() {
-        check(
-            &built(|[p, ..], [x, y]| [x / p, y]),
-            "v0 = load 3; v1 = load 6; v2 = 1.0; v3 = div v2 v0; v4 = mul v1 v3; store 6 = v4",
-        );
-    }
-
-    #[test]
-    fn chains_off_the_critical_path_keep_their_order() {
-        // The second state has a much shorter chain than the first, so its division and its sum are unchanged.
-        let func = built(|[p, q, _], [x, y]| [(-(x * x).of(Unary::Exp)).of(Unary::Exp), y / p + q * (x * x - x)]);
-        assert_eq!(reassociate(&func, false).to_string(), func.to_string());
-    }
-
-    #[test]
-    fn late_factors_come_last_and_the_late_divisor_follows_them() {
-        // p · |x| / g · y, where g depends on x: one division, after g.
-        let func = built(|[p, q, _], [x, y]| {
-            let g = q + (x * x).of(Unary::Exp);
-            [p * x.abs() / g * y, y]
-        });
-        let listing = reassociate(&func, false).to_string();
-        let last: Vec<&str> = listing.lines().rev().take(2).collect();
-        assert!(last[1].contains("= div"), "{listing}");
-    }
-
-    #[test]
-    fn a_sum_affine_in_a_late_value_is_split() {
-        // x + p (y − q exp(x)): the exponential enters last, and its factor p q is computed before.
-        let func = built(|[p, q, _], [x, y]| [x + p * (y - q * x.of(Unary::Exp)), y]);
-        let listing = reassociate(&func, false).to_string();
-        let expected = "v0 = load 3; v1 = load 4; v2 = load 6; v3 = load 7; v4 = exp v2; v5 = mul v0 v3; \
-                        v6 = mul v0 v1; v7 = add v2 v5; v8 = mul v4 v6; v9 = sub v7 v8; store 6 = v9";
-        let found: Vec<&str> = listing.lines().skip(1).map(str::trim).collect();
-        assert_eq!(found.join("; "), expected);
-    }
-
-    #[test]
-    fn time_is_ready_before_the_states() {
-        // z + h (v − p |v| / g z), where v and g depend on time: 1/g and z + h v are ready before the step, and the
-        // chain is one fused multiply-add.
-        let layout = layout();
-        let build = Shared::new(Build::new("step"));
-        let load = |slot| Real::new(&build, build.borrow_mut().load(slot));
-        let (t, h, p, z) =
-            (load(Slot::TIME), load(Slot::STEP), load(layout.params.slot(0)), load(layout.states.slot(0)));
-        let v = t.of(Unary::Sin);
-        let g = 1.0 + (-(v * v)).of(Unary::Exp);
-        let next = (z + h * (v - p * v.abs() / g * z)).value;
-        let mut build = build.into_inner();
-        build.store(layout.states.slot(0), next);
-        let func = crate::opt::contract::contract(&reassociate(&build.finish(), false), &layout);
-        assert!(critical_path(&func) <= 11, "{func}");
-    }
-
     #[test]
     fn a_chain_that_is_affine_throughout_is_split_in_the_middle() {
         // An observer of position and speed, iterated:
