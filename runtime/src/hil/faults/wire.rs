@@ -116,7 +116,7 @@ struct Line {
     taken: bool,
     /// Greatest plausible change in one tick; infinite: not checked.
     reach: f64,
-    /// Tolerance of some quantisation steps, SI.
+    /// Tolerance of some quantisation steps in one tick, SI: the rig allows four of them a tick.
     room: f64,
     /// Accepted value, and ticks since it arrived; none before the first check.
     believed: Option<(f64, u32)>,
@@ -147,7 +147,7 @@ impl Line {
             return Ok(());
         }
         let way = (self.told - before).abs();
-        self.taken = self.told.is_finite() && way <= self.reach * f64::from(since) * (1.0 + 1e-9) + self.room;
+        self.taken = self.told.is_finite() && way <= (self.reach * (1.0 + 1e-9) + self.room) * f64::from(since);
         if self.taken {
             self.odd = 0;
             // At the edge of the plausible range the rig may hold the previous value.
