@@ -309,8 +309,8 @@ experiment stop {{
 
 /// Steps of h, h/2 and h/4 all stop a mass at the same point if its contact begins to hold in the last quarter of a
 /// step before it: three runs agree and are wrong. A comparison with runs that locate the event detects this; with
-/// companions of the method itself (no adaptive program in `estimate::errors`), 6 of the first 10 cases are not
-/// covered.
+/// companions of the method itself (no adaptive program in `estimate::accompanied`) the first case, seed 1, is off by
+/// 4e-6 with an estimate of 2e-14.
 #[test]
 fn a_contact_that_holds_just_before_a_point_of_all_steps_is_judged() {
     let band = 1e-3;
