@@ -16,6 +16,7 @@ use crate::rng::Chance;
 use crate::safety::Cause;
 use crate::testing::models::Model;
 use crate::testing::rigs;
+use crate::testing::seeds::{number, seeds};
 use abi::rig::{Kind, Rig, Signal, What};
 use abi::{Function, Instance};
 use std::collections::VecDeque;
@@ -419,8 +420,7 @@ fn shrunk(script: &Script, why: String) -> (Script, String) {
 
 #[test]
 fn model_deviations_and_active_contacts_are_detected_in_time() {
-    let number = |name: &str| std::env::var(name).ok().and_then(|text| text.parse::<u64>().ok());
-    let seeds = number("FRIC_SEED").map_or(0..number("FRIC_RUNS").unwrap_or(RUNS), |seed| seed..seed + 1);
+    let seeds = seeds(RUNS);
     let all = seeds.end - seeds.start;
     let counts_only = number("FRIC_COUNT").is_some();
     let (mut kinds, mut failed) = ([0; 5], Vec::new());

@@ -14,6 +14,7 @@ use crate::record::log::{CYCLE, LOST, Message, Reader, STATE, Sections, Settings
 use crate::record::parts::{Disk, Limits, System};
 use crate::rng::Chance;
 use crate::testing::rigs;
+use crate::testing::seeds::seeds;
 use std::io::{self, ErrorKind, Write};
 use std::path::Path;
 use std::sync::{Arc, Condvar, Mutex};
@@ -367,8 +368,7 @@ fn shrunk(script: &Script, why: String) -> (Script, String) {
 
 #[test]
 fn each_message_is_logged_or_counted_for_any_disk_fault() {
-    let number = |name: &str| std::env::var(name).ok().and_then(|text| text.parse::<u64>().ok());
-    let seeds = number("FRIC_SEED").map_or(0..number("FRIC_RUNS").unwrap_or(RUNS), |seed| seed..seed + 1);
+    let seeds = seeds(RUNS);
     let all = seeds.end - seeds.start;
     let (mut dropped, mut broken, mut rolled, mut skipped) = (0, 0, 0, 0);
     for seed in seeds {

@@ -7,6 +7,7 @@
 use super::emergency::{guard, prepare};
 use crate::can::Prepared;
 use crate::rng::Chance;
+use crate::testing::seeds::{number, seeds};
 use std::fs::File;
 use std::hint::black_box;
 use std::os::fd::AsRawFd;
@@ -170,7 +171,6 @@ fn run(seed: u64) -> Result<(), String> {
 
 #[test]
 fn however_a_process_ends_its_stop_frames_reach_its_buses_and_nothing_else() {
-    let number = |name: &str| std::env::var(name).ok().and_then(|text| text.parse::<u64>().ok());
     if let Some(seed) = number("FRIC_ENDING") {
         let folder = std::env::var_os("FRIC_FOLDER").expect("where its files lie");
         let thread = std::thread::Builder::new().stack_size(STACK);
@@ -179,7 +179,7 @@ fn however_a_process_ends_its_stop_frames_reach_its_buses_and_nothing_else() {
         assert!(ends.is_ok(), "the cycle has failed");
         return;
     }
-    let seeds = number("FRIC_SEED").map_or(0..number("FRIC_RUNS").unwrap_or(RUNS), |seed| seed..seed + 1);
+    let seeds = seeds(RUNS);
     let failed: Vec<String> = seeds.filter_map(|seed| run(seed).err()).collect();
     if let Some(first) = failed.first() {
         println!("mutant caught: {first}");

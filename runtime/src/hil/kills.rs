@@ -17,6 +17,7 @@ use crate::drive::state::State;
 use crate::realtime::clock::Clock;
 use crate::rng::Chance;
 use crate::testing::rigs;
+use crate::testing::seeds::{number, seeds};
 use abi::Instance;
 use abi::rig::Rig;
 use std::process::{Command, Stdio};
@@ -197,11 +198,10 @@ fn run(script: &Script) -> Result<Shown, String> {
 
 #[test]
 fn the_drives_of_a_killed_process_lose_their_torque_within_their_time_out() {
-    let number = |name: &str| std::env::var(name).ok().and_then(|text| text.parse::<u64>().ok());
     if let Some(seed) = number("FRIC_KILLED") {
         return child(&Script::of(seed), number("FRIC_PORT").expect("where its drives are") as u16);
     }
-    let seeds = number("FRIC_SEED").map_or(0..number("FRIC_RUNS").unwrap_or(RUNS), |seed| seed..seed + 1);
+    let seeds = seeds(RUNS);
     let all = (seeds.end - seeds.start) as usize;
     let next = AtomicU64::new(seeds.start);
     let found = Mutex::new(Vec::new());

@@ -17,6 +17,7 @@ use crate::realtime::clock::{Clock, monotonic_ns};
 use crate::rng::Chance;
 use crate::safety::Cause;
 use crate::testing::rigs;
+use crate::testing::seeds::seeds;
 use std::cell::RefCell;
 use std::rc::Rc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -284,8 +285,7 @@ fn judge_early(bites: &[u64], cycles: &[Seen], script: &Script) -> Result<Shown,
 
 #[test]
 fn the_watchdog_stops_a_stalled_cycle_in_time_and_no_other() {
-    let number = |name: &str| std::env::var(name).ok().and_then(|text| text.parse::<u64>().ok());
-    let seeds = number("FRIC_SEED").map_or(0..number("FRIC_RUNS").unwrap_or(RUNS), |seed| seed..seed + 1);
+    let seeds = seeds(RUNS);
     let all = seeds.end - seeds.start;
     let next = AtomicU64::new(seeds.start);
     let found = Mutex::new(Vec::new());

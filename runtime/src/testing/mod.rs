@@ -1,5 +1,6 @@
-//! Test fixtures: hand-written models, drives and rigs.
+//! Test fixtures: hand-written models, drives and rigs; seeds of generated tests.
 
 pub mod models;
 pub mod drives;
 pub mod rigs;
+pub mod seeds;

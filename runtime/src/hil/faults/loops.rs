@@ -17,6 +17,7 @@ use crate::hil::simulated::{MASTER, Pace, World};
 use crate::realtime::clock::Clock;
 use crate::rng::Chance;
 use crate::safety::Cause;
+use crate::testing::seeds::{number, seeds};
 use abi::rig::Rig;
 use std::collections::VecDeque;
 
@@ -234,13 +235,11 @@ fn shrunk(script: &Script, why: String) -> (Script, String) {
 
 #[test]
 fn an_unexplained_speed_or_position_stops_the_rig_within_a_second() {
-    let (first, runs) = match super::number("FRIC_SEED") {
-        Some(seed) => (seed, 1),
-        None => (super::number("FRIC_FIRST").unwrap_or(0), super::number("FRIC_RUNS").unwrap_or(RUNS)),
-    };
-    let counts_only = super::number("FRIC_COUNT").is_some();
+    let seeds = seeds(RUNS);
+    let runs = seeds.end - seeds.start;
+    let counts_only = number("FRIC_COUNT").is_some();
     let (mut stopped, mut longest_ns, mut failed) = (0, 0, Vec::new());
-    for seed in first..first + runs {
+    for seed in seeds {
         let script = Script::of(seed);
         match run(&script) {
             Ok(after) => {

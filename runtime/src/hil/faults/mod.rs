@@ -16,6 +16,7 @@ mod shrink;
 mod scripts;
 mod loops;
 
+use crate::testing::seeds::{number, seeds};
 use invariants::Violation;
 use rigs::Sort;
 use space::{EVER, Fault, Ill, MS, Phase, Script, What};
@@ -38,10 +39,6 @@ fn told(script: &Script, violation: Violation) -> String {
     let (least, how) = shrink::shrink(script, violation, |script| run::run(script).map(drop));
     let Violation { broken, at_ns, text } = how;
     format!("{broken:?} after {:.3} ms: {text}\n{least}", at_ns as f64 / 1e6)
-}
-
-fn number(name: &str) -> Option<u64> {
-    std::env::var(name).ok().and_then(|text| text.parse().ok())
 }
 
 /// Runs scripts; stops at the first failure, or counts failures.
@@ -80,11 +77,7 @@ fn all(scripts: impl Iterator<Item = Script>) {
 
 #[test]
 fn random_faults_break_no_property() {
-    let (first, runs) = match number("FRIC_SEED") {
-        Some(seed) => (seed, 1),
-        None => (number("FRIC_FIRST").unwrap_or(0), number("FRIC_RUNS").unwrap_or(RUNS)),
-    };
-    all((first..first + runs).map(Script::of));
+    all(seeds(RUNS).map(Script::of));
 }
 
 /// All pairs of faults in a small rig's frames, in one phase and for ever.
