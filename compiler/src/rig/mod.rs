@@ -620,8 +620,8 @@ impl<'a> Reader<'a, '_> {
         }
         let plant = plant?;
         let mut found = Vec::new();
-        let plant_types = analyse(&plant.system, self.files, Depth::Units, &Diagnostic::is_error, &mut found);
         let control_types = analyse(&control, self.files, Depth::Causality, &Diagnostic::is_error, &mut found);
+        let plant_types = analyse(&plant.system, self.files, Depth::Units, &Diagnostic::is_error, &mut found);
         self.diagnostics.extend(found);
         for stop in &stops {
             if !control_types.boolean[stop.0 as usize] && control_types.nodes[stop.0 as usize].is_some() {
