@@ -108,7 +108,7 @@ fn main() {
     let hand = |hands: &libloading::Symbol<*const Hand>, name: &str| {
         // SAFETY: the table ends with an entry without a name.
         let mut entries = (0..).map(|k| unsafe { &*(**hands).add(k) }).take_while(|hand| !hand.name.is_null());
-        entries.find(|hand| words(hand.name) == [name]).unwrap_or_else(|| panic!("`models.c` has no {name}"))
+        entries.find(|hand| words(hand.name) == [name])
     };
     let chosen = std::env::args().skip(1).find(|word| !word.starts_with('-')).unwrap_or_default();
     let modules = project::Disk.modules();
@@ -141,7 +141,12 @@ fn main() {
             left_out.push(format!("{name}: {why}"));
             continue;
         }
-        let hands = hands.each_ref().map(|hands| hand(hands, name));
+        let found = hands.each_ref().map(|hands| hand(hands, name));
+        if found.iter().any(Option::is_none) {
+            left_out.push(format!("{name}: models.c has no C for it yet"));
+            continue;
+        }
+        let hands = found.map(|hand| hand.expect("each place has it"));
         let Times { c, c_to_c, checked, ours, bare, unprepared, c_in_turn, ours_in_turn } =
             compare(name, &mut loaded, (hands, &around));
         let of_model = [ours / c, ours / checked, bare / c, unprepared / c, ours_in_turn / c_in_turn, c_to_c];
