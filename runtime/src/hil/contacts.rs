@@ -14,9 +14,9 @@ use crate::drive::simulated_plant::Bench;
 use crate::realtime::clock::Clock;
 use crate::rng::Chance;
 use crate::safety::Cause;
+use crate::testing::generated::{self, changed, hold, seeds};
 use crate::testing::models::Model;
 use crate::testing::rigs;
-use crate::testing::seeds::{number, seeds};
 use abi::rig::{Kind, Rig, Signal, What};
 use abi::{Function, Instance};
 use std::collections::VecDeque;
@@ -392,59 +392,28 @@ fn started(script: &Script, at: f64) -> (Hil, World, Rig) {
 
 /// Simplifies a failing script while it still fails.
 fn shrunk(script: &Script, why: String) -> (Script, String) {
-    let (mut best, mut how) = (*script, why);
-    'again: loop {
-        let plainer: [fn(&mut Script); 8] = [
-            |script| script.event = Event::Nothing,
-            |script| script.told = script.inertia,
-            |script| script.bearings = 0.0,
-            |script| script.damping = 0.0,
-            |script| script.needs_look = false,
-            |script| script.energy_stops = false,
-            |script| script.predicts = false,
-            |script| (script.delay, script.lag) = (2e-3, 0.6e-3),
-        ];
-        for plain in plainer {
-            let mut other = best;
-            plain(&mut other);
-            if other != best
-                && let Err(why) = run(&other)
-            {
-                (best, how) = (other, why);
-                continue 'again;
-            }
-        }
-        return (best, how);
-    }
+    let changes: [fn(&mut Script); 8] = [
+        |script| script.event = Event::Nothing,
+        |script| script.told = script.inertia,
+        |script| script.bearings = 0.0,
+        |script| script.damping = 0.0,
+        |script| script.needs_look = false,
+        |script| script.energy_stops = false,
+        |script| script.predicts = false,
+        |script| (script.delay, script.lag) = (2e-3, 0.6e-3),
+    ];
+    generated::shrunk(script, why, |script| changed(script, &changes), run)
 }
 
 #[test]
 fn model_deviations_and_active_contacts_are_detected_in_time() {
     let seeds = seeds(RUNS);
     let all = seeds.end - seeds.start;
-    let counts_only = number("FRIC_COUNT").is_some();
-    let (mut kinds, mut failed) = ([0; 5], Vec::new());
-    for seed in seeds {
-        let script = Script::of(seed);
-        match run(&script) {
-            Ok(Shown { warned, energy_stop, unpredicted, needed, quiet }) => {
-                let shown = [warned, energy_stop, unpredicted, needed, quiet];
-                kinds.iter_mut().zip(shown).for_each(|(count, shown)| *count += u64::from(shown));
-            }
-            Err(why) if counts_only => {
-                println!("seed {seed}: {why}\n  {script:?}");
-                failed.push(seed);
-            }
-            Err(why) if std::env::var_os("FRIC_MUTANT").is_some() => {
-                println!("mutant caught with seed {seed}: {why}");
-                panic!("seed {seed}");
-            }
-            Err(why) => {
-                let (script, why) = shrunk(&script, why);
-                panic!("FRIC_SEED={seed} repeats it: {why}\n{script:?}");
-            }
-        }
-    }
+    let mut kinds = [0; 5];
+    let failed = hold(seeds, Script::of, run, shrunk, |Shown { warned, energy_stop, unpredicted, needed, quiet }| {
+        let shown = [warned, energy_stop, unpredicted, needed, quiet];
+        kinds.iter_mut().zip(shown).for_each(|(count, shown)| *count += u64::from(shown));
+    });
     let [warned, stopped, unpredicted, needed, quiet] = kinds;
     println!(
         "{all} runs: {warned} had to warn, {stopped} stopped for energy, {unpredicted} were not as told, {needed} of them \

@@ -13,8 +13,8 @@ use super::trace;
 use crate::record::log::{CYCLE, LOST, Message, Reader, STATE, Sections, Settings, Sink};
 use crate::record::parts::{Disk, Limits, System};
 use crate::rng::Chance;
+use crate::testing::generated::{self, hold, seeds};
 use crate::testing::rigs;
-use crate::testing::seeds::seeds;
 use std::io::{self, ErrorKind, Write};
 use std::path::Path;
 use std::sync::{Arc, Condvar, Mutex};
@@ -343,8 +343,7 @@ fn run(script: &Script) -> Result<Fate, String> {
 
 /// Simplifies a failing script while it still fails.
 fn shrunk(script: &Script, why: String) -> (Script, String) {
-    let (mut best, mut how) = (script.clone(), why);
-    'again: loop {
+    let simpler = |best: &Script| {
         let mut smaller: Vec<Script> = (0..best.ills.len())
             .map(|at| {
                 let mut other = best.clone();
@@ -356,14 +355,10 @@ fn shrunk(script: &Script, why: String) -> (Script, String) {
         smaller.push(Script { queue: 20_000, ..best.clone() });
         smaller.push(Script { fails: false, ..best.clone() });
         smaller.push(Script { cycles: best.cycles / 2, ..best.clone() });
-        for other in smaller.into_iter().filter(|other| *other != best && other.cycles > 50) {
-            if let Err(why) = run(&other) {
-                (best, how) = (other, why);
-                continue 'again;
-            }
-        }
-        return (best, how);
-    }
+        smaller.retain(|other| other.cycles > 50);
+        smaller
+    };
+    generated::shrunk(script, why, simpler, run)
 }
 
 #[test]
@@ -371,27 +366,15 @@ fn each_message_is_logged_or_counted_for_any_disk_fault() {
     let seeds = seeds(RUNS);
     let all = seeds.end - seeds.start;
     let (mut dropped, mut broken, mut rolled, mut skipped) = (0, 0, 0, 0);
-    for seed in seeds {
-        let script = Script::of(seed);
-        match run(&script) {
-            Ok(fate) => {
-                dropped += u64::from(fate.dropped > 0 && !fate.broken);
-                broken += u64::from(fate.broken);
-                rolled += u64::from(fate.parts > 1);
-                skipped += u64::from(fate.skipped > 0);
-            }
-            Err(why) if std::env::var_os("FRIC_MUTANT").is_some() => {
-                println!("mutant caught with seed {seed}: {why}");
-                panic!("seed {seed}");
-            }
-            Err(why) => {
-                let (script, why) = shrunk(&script, why);
-                panic!("FRIC_SEED={seed} repeats it: {why}\n{script:?}");
-            }
-        }
-    }
+    let failed = hold(seeds, Script::of, run, shrunk, |fate| {
+        dropped += u64::from(fate.dropped > 0 && !fate.broken);
+        broken += u64::from(fate.broken);
+        rolled += u64::from(fate.parts > 1);
+        skipped += u64::from(fate.skipped > 0);
+    });
     println!(
         "{all} runs: {dropped} dropped some, {broken} broke, {rolled} went on in further files, {skipped} with gaps"
     );
+    assert!(failed.is_empty(), "{failed:?}");
     assert!(all < RUNS || [dropped, broken, rolled, skipped].iter().all(|count| *count > 0), "each kind comes");
 }

@@ -7,7 +7,7 @@
 use super::emergency::{guard, prepare};
 use crate::can::Prepared;
 use crate::rng::Chance;
-use crate::testing::seeds::{number, seeds};
+use crate::testing::generated::{number, seeds};
 use std::fs::File;
 use std::hint::black_box;
 use std::os::fd::AsRawFd;

@@ -16,13 +16,11 @@ use crate::drive::simulated_plant::Bench;
 use crate::drive::state::State;
 use crate::realtime::clock::Clock;
 use crate::rng::Chance;
+use crate::testing::generated::{failures, number, on_threads, seeds};
 use crate::testing::rigs;
-use crate::testing::seeds::{number, seeds};
 use abi::Instance;
 use abi::rig::Rig;
 use std::process::{Command, Stdio};
-use std::sync::Mutex;
-use std::sync::atomic::{AtomicU64, Ordering};
 
 /// Seeds in `cargo test`, and threads that share them.
 const RUNS: u64 = 12;
@@ -203,30 +201,8 @@ fn the_drives_of_a_killed_process_lose_their_torque_within_their_time_out() {
     }
     let seeds = seeds(RUNS);
     let all = (seeds.end - seeds.start) as usize;
-    let next = AtomicU64::new(seeds.start);
-    let found = Mutex::new(Vec::new());
-    std::thread::scope(|scope| {
-        for _ in 0..THREADS {
-            scope.spawn(|| {
-                loop {
-                    let seed = next.fetch_add(1, Ordering::Relaxed);
-                    if seed >= seeds.end {
-                        return;
-                    }
-                    let shown = run(&Script::of(seed));
-                    found.lock().unwrap().push((seed, shown));
-                }
-            });
-        }
-    });
-    let found = found.into_inner().unwrap();
-    let failed: Vec<String> = (found.iter())
-        .filter_map(|(seed, shown)| Some((seed, shown.as_ref().err()?)))
-        .map(|(seed, why)| format!("FRIC_SEED={seed} repeats it: {why}\n{:?}", Script::of(*seed)))
-        .collect();
-    if let Some(first) = failed.first() {
-        println!("mutant caught: {first}");
-    }
+    let found = on_threads(seeds, THREADS, |seed| run(&Script::of(seed)));
+    let failed = failures(&found, Script::of);
     let (mut stopped, mut latest, mut nothing) = (0, 0.0f64, 0);
     for shown in found.iter().filter_map(|(_, shown)| shown.as_ref().ok()) {
         match shown {

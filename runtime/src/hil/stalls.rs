@@ -16,11 +16,10 @@ use crate::drive::Step;
 use crate::realtime::clock::{Clock, monotonic_ns};
 use crate::rng::Chance;
 use crate::safety::Cause;
+use crate::testing::generated::{failures, on_threads, seeds};
 use crate::testing::rigs;
-use crate::testing::seeds::seeds;
 use std::cell::RefCell;
 use std::rc::Rc;
-use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
@@ -287,28 +286,8 @@ fn judge_early(bites: &[u64], cycles: &[Seen], script: &Script) -> Result<Shown,
 fn the_watchdog_stops_a_stalled_cycle_in_time_and_no_other() {
     let seeds = seeds(RUNS);
     let all = seeds.end - seeds.start;
-    let next = AtomicU64::new(seeds.start);
-    let found = Mutex::new(Vec::new());
-    std::thread::scope(|scope| {
-        for _ in 0..THREADS {
-            scope.spawn(|| {
-                loop {
-                    let seed = next.fetch_add(1, Ordering::Relaxed);
-                    if seed >= seeds.end {
-                        return;
-                    }
-                    found.lock().unwrap().push((seed, run(&Script::of(seed))));
-                }
-            });
-        }
-    });
-    let found = found.into_inner().unwrap();
-    let failed = found.iter().filter_map(|(seed, shown)| Some((seed, shown.as_ref().err()?)));
-    let failed: Vec<String> =
-        failed.map(|(seed, why)| format!("FRIC_SEED={seed} repeats it: {why}\n{:?}", Script::of(*seed))).collect();
-    if let Some(first) = failed.first() {
-        println!("mutant caught: {first}");
-    }
+    let found = on_threads(seeds, THREADS, |seed| run(&Script::of(seed)));
+    let failed = failures(&found, Script::of);
     let shown: Vec<Shown> = found.iter().filter_map(|(_, shown)| shown.clone().ok()).collect();
     let count = |is: fn(&Shown) -> bool| shown.iter().filter(|shown| is(shown)).count();
     let kinds = [count(|shown| shown.had_to), count(|shown| shown.asleep), count(|shown| shown.in_time)];

@@ -1,6 +1,6 @@
-//! Test fixtures: hand-written models, drives and rigs; seeds of generated tests.
+//! Test fixtures: hand-written models, drives and rigs; generated tests.
 
 pub mod models;
 pub mod drives;
 pub mod rigs;
-pub mod seeds;
+pub mod generated;

@@ -17,7 +17,7 @@ use crate::hil::simulated::{MASTER, Pace, World};
 use crate::realtime::clock::Clock;
 use crate::rng::Chance;
 use crate::safety::Cause;
-use crate::testing::seeds::{number, seeds};
+use crate::testing::generated::{self, changed, hold, seeds};
 use abi::rig::Rig;
 use std::collections::VecDeque;
 
@@ -209,57 +209,26 @@ fn plant_fault(script: &Script, world: &World, now_ns: u64) {
 
 /// Simplifies a failing script while it still fails.
 fn shrunk(script: &Script, why: String) -> (Script, String) {
-    let (mut best, mut how) = (*script, why);
-    'again: loop {
-        let plainer: [fn(&mut Script); 6] = [
-            |script| script.ill = Ill::Nothing,
-            |script| script.rig.eager = false,
-            |script| script.rig.swing = 0.8,
-            |script| script.rig.hertz = 0.2,
-            |script| (script.delay, script.lag) = (0.8e-3, 0.6e-3),
-            |script| script.after = 100 * MS,
-        ];
-        for plain in plainer {
-            let mut other = best;
-            plain(&mut other);
-            if other != best
-                && let Err(why) = run(&other)
-            {
-                (best, how) = (other, why);
-                continue 'again;
-            }
-        }
-        return (best, how);
-    }
+    let changes: [fn(&mut Script); 6] = [
+        |script| script.ill = Ill::Nothing,
+        |script| script.rig.eager = false,
+        |script| script.rig.swing = 0.8,
+        |script| script.rig.hertz = 0.2,
+        |script| (script.delay, script.lag) = (0.8e-3, 0.6e-3),
+        |script| script.after = 100 * MS,
+    ];
+    generated::shrunk(script, why, |script| changed(script, &changes), run)
 }
 
 #[test]
 fn an_unexplained_speed_or_position_stops_the_rig_within_a_second() {
     let seeds = seeds(RUNS);
     let runs = seeds.end - seeds.start;
-    let counts_only = number("FRIC_COUNT").is_some();
-    let (mut stopped, mut longest_ns, mut failed) = (0, 0, Vec::new());
-    for seed in seeds {
-        let script = Script::of(seed);
-        match run(&script) {
-            Ok(after) => {
-                stopped += u64::from(after.is_some_and(|after| after > PATIENCE_NS / 2));
-                longest_ns = longest_ns.max(after.unwrap_or(0));
-            }
-            Err(why) if counts_only => {
-                println!("seed {seed}: {why}\n  {script:?}");
-                failed.push(seed);
-            }
-            Err(why) if std::env::var_os("FRIC_MUTANT").is_some() => {
-                println!("mutant caught with seed {seed}: {why}");
-                panic!("seed {seed}");
-            }
-            Err(why) => {
-                let (script, why) = shrunk(&script, why);
-                panic!("FRIC_SEED={seed} repeats it: {why}\n{script:?}");
-            }
-        }
-    }
+    let (mut stopped, mut longest_ns) = (0, 0);
+    let failed = hold(seeds, Script::of, run, shrunk, |after| {
+        stopped += u64::from(after.is_some_and(|after| after > PATIENCE_NS / 2));
+        longest_ns = longest_ns.max(after.unwrap_or(0));
+    });
     let longest = longest_ns as f64 * 1e-6;
     println!(
         "{runs} runs: {stopped} were found by this watch, after {longest:.0} ms at most; {} failed: {failed:?}",

@@ -9,14 +9,15 @@
 mod rigs;
 mod space;
 mod heap;
-mod invariants;
+mod broken;
 mod wire;
+mod invariants;
 mod run;
 mod shrink;
 mod scripts;
 mod loops;
 
-use crate::testing::seeds::{number, seeds};
+use crate::testing::generated::{number, seeds};
 use invariants::Violation;
 use rigs::Sort;
 use space::{EVER, Fault, Ill, MS, Phase, Script, What};

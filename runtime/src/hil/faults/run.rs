@@ -3,7 +3,8 @@
 //!
 //! In: a [`Script`]. Out: a summary of the run, or the first property it violated.
 
-use super::invariants::{Broken, CLAMPED_NS, Judge, RAMP, STANDSTILL_NS, Violation};
+use super::broken::Broken;
+use super::invariants::{CLAMPED_NS, Judge, RAMP, STANDSTILL_NS, Violation};
 use super::rigs::TWINS;
 use super::space::{EVER, Fault, Ill, MS, Only, Phase, Script, What};
 use super::wire::{Tap, Traffic};

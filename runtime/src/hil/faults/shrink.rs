@@ -1,14 +1,12 @@
-//! Shrinks a failing script: fewer faults, shorter, in a simpler phase, on a simpler rig (delta debugging: Zeller,
-//! Hildebrandt, "Simplifying and isolating failure-inducing input", 2002).
+//! Shrinks a failing script: fewer faults, shorter, in a simpler phase, on a simpler rig.
 //!
 //! In: a script and its violation. Out: a script with the same violation that no further simplification preserves.
 
-use super::invariants::{Broken, Violation};
+use super::broken::Broken;
+use super::invariants::Violation;
 use super::rigs::{Made, PLAIN, Sort};
 use super::space::{EVER, Fault, Ill, MS, Only, Phase, Script, What};
-
-/// Most scripts that are tried.
-const MOST: usize = 400;
+use crate::testing::generated;
 
 /// Shrinks a script that violates a property; returns the smallest script found and its violation.
 pub fn shrink(
@@ -16,25 +14,11 @@ pub fn shrink(
     first: Violation,
     run: impl Fn(&Script) -> Result<(), Violation>,
 ) -> (Script, Violation) {
-    let (mut best, mut how) = (script.clone(), first);
-    let kind: Broken = how.broken;
-    let mut tried = 0;
-    'again: loop {
-        for smaller in simpler(&best) {
-            tried += 1;
-            if tried > MOST {
-                break 'again;
-            }
-            if let Err(violation) = run(&smaller)
-                && violation.broken == kind
-            {
-                (best, how) = (smaller, violation);
-                continue 'again;
-            }
-        }
-        break;
-    }
-    (best, how)
+    let kind: Broken = first.broken;
+    generated::shrunk(script, first, simpler, |script| match run(script) {
+        Err(violation) if violation.broken != kind => Ok(()),
+        other => other,
+    })
 }
 
 /// Scripts that are simpler in one respect, the largest simplification first.

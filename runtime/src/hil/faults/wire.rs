@@ -4,7 +4,7 @@
 //! readings of each drive, and the property that a reading violates. Frames are decoded here a second time,
 //! independently, because the rig's decoding is under test.
 
-use super::invariants::Broken;
+use super::broken::Broken;
 use super::rigs::{FRAME_ANSWER, INERTIA, Made};
 use crate::can::sim::Port;
 use crate::can::{Bus, Event, Frame, Health, Received, Refused};
@@ -130,7 +130,7 @@ impl Line {
         self.fresh |= fresh;
     }
 
-    /// Checks one cycle of the model. `quick`: the drives are told to stop at once.
+    /// Checks one cycle of the model. `quick`: a quick stop is under way.
     fn judge(&mut self, believed: f64, ticks: u32, quick: bool) -> Result<(), (Broken, String)> {
         self.taken = false;
         if !believed.is_finite() {
@@ -155,12 +155,16 @@ impl Line {
         } else {
             self.odd += 1;
             if believed != before {
-                let text = format!("{} is told, {before} was and {believed} is believed", self.told);
+                let text =
+                    format!("{} is reported, {before} was accepted before and {believed} is accepted now", self.told);
                 return Err((Broken::Jump, text));
             }
         }
         if self.odd >= ODD && !quick {
-            return Err((Broken::Odd, format!("{} is told for {} ticks, {before} is believed", self.told, self.odd)));
+            return Err((
+                Broken::Odd,
+                format!("{} is reported for {} ticks, {before} is accepted", self.told, self.odd),
+            ));
         }
         Ok(())
     }
