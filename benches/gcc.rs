@@ -17,7 +17,8 @@ pub fn built_at<const N: usize>(source: &str, leads: [usize; N]) -> [Library; N]
     gcc("-c", &object, &["-O3", "-march=native", "-fPIC", "-Wall", "-Wextra", "-pedantic"], &[&in_benches(source)]);
     leads.map(|lead| {
         let before = room(source, &format!("{lead}.s"));
-        let text = format!(".text\n.skip {lead}\n.section .note.GNU-stack\n");
+        let skip = if lead > 0 { format!(".skip {lead}\n") } else { String::new() };
+        let text = format!(".text\n{skip}.section .note.GNU-stack\n");
         std::fs::write(&before, text).expect("there is room for it");
         let library = room(source, &format!("{lead}.so"));
         gcc("-shared", &library, &[], &[&before, &object]);

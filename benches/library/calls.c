@@ -1,6 +1,5 @@
-/* What stands around each call of a step: the same instructions for every kind of step, so that where they lie favours none.
- * A step takes up to five arguments, of which ours knows three; C that does not watch returns nothing, so nothing is asked
- * of it: the mask is 0. */
+/* The loop around the calls of a step: the same instructions for every kind of step, so that their place favours none. A
+ * step takes up to five arguments, of which ours reads three. C without guards returns nothing: its mask is 0. */
 #include <stddef.h>
 #include <stdint.h>
 
@@ -13,19 +12,19 @@ struct calls {
     const void *third;
     double *fourth;
     double h;
-    /* Of the status, what is asked. */
+    /* The bits of the status to check. */
     int64_t mask;
-    /* Where inputs go, and how many. */
+    /* Destination of the inputs, and their number. */
     volatile double *inputs;
     size_t width;
-    /* Where outputs come from. */
+    /* Base and indices of the outputs. */
     const volatile double *base;
     const size_t *outputs;
     size_t number_of_outputs;
 };
 
-/* Calls with one row of inputs after the other; whether no step has failed. All outputs are read. If it waits, nothing of a
- * call can begin that needs an input before the call before has left its outputs; else nothing of what stands here does. */
+/* Calls the step with one row of inputs after the other; returns whether no step has failed. All outputs are read. If
+ * `waits`, the inputs of a call depend on the outputs of the previous one; else the calls are independent. */
 static inline int made(const struct calls *calls, const double *row, size_t number, int waits) {
     const struct calls c = *calls;
     double sum = 0;

@@ -27,26 +27,20 @@ mod compile {
 
 #[path = "../gcc.rs"]
 mod gcc;
+mod hand;
 
-use abi::description::Kind;
 use abi::plan::Method;
 use abi::table::{Entry, Machine};
-use abi::{Code, Description, Function, Instance, Slot};
+use abi::{Code, Function, Instance, Slot};
 use compiler::codegen::jit;
 use compiler::ir::Func;
 use compiler::ir::program::Program;
 use compiler::{Changes, NoSources, Sources};
-use std::ffi::{CStr, c_char};
+use hand::{BEYOND, COMPARED, COURSE, Hand, LEFT_OUT, Pair};
 use std::hint::black_box;
 use std::sync::Arc;
 use std::time::Instant;
 
-/// Length of the input sequence, which then repeats.
-const COURSE: usize = 4096;
-/// Steps for which both must agree.
-const COMPARED: usize = 20_000;
-/// Largest difference of a quantity, relative to its largest value so far.
-const TOLERANCE: f64 = 1e-9;
 const ROUNDS: usize = PLACES * 29;
 /// Number of places of the code, used in turn.
 const PLACES: usize = 12;
@@ -55,61 +49,13 @@ const KINDS: usize = 8;
 /// Calls of a round, and warm-up calls before it.
 const CALLS: usize = 1000;
 const WARM: usize = 200;
-
-/// Models without C, and why.
-const LEFT_OUT: &[(&str, &str)] = &[
-    ("ForceBench", "a mass around the contact in its slot, not a model to call by itself"),
-    ("ObserverBench", "a mass around the observer in its slot"),
-    ("SpeedBench", "hands its speed to the contact in its slot"),
-    ("SpringBench", "a spring around the contact in its slot"),
-    ("Servo", "a whole closed loop: benches/step.rs has it"),
-    ("Pull", "a whole closed loop"),
-    ("Hold", "a whole closed loop"),
-];
-
-/// A model in C: the names of its ports, which map numbers to slots, and its step.
-#[repr(C)]
-struct Hand {
-    name: *const c_char,
-    inputs: *const c_char,
-    params: *const c_char,
-    states: *const c_char,
-    outputs: *const c_char,
-    step: unsafe extern "C" fn(*mut f64, *const f64, *const f64, *mut f64, f64),
-    /// The same with guards.
-    checked: unsafe extern "C" fn(*mut f64, *const f64, *const f64, *mut f64, f64) -> i64,
-    /// Which states it guards, as a bit mask.
-    watched: u64,
-    number_of_outputs: u64,
-}
-
-fn words(text: *const c_char) -> Vec<String> {
-    // SAFETY: the table holds C strings, which live as long as the library.
-    let text = unsafe { CStr::from_ptr(text) }.to_str().expect("names are ASCII");
-    text.split_whitespace().map(String::from).collect()
-}
-
-/// The meaning of a name of a state in C.
-enum State {
-    /// In the block.
-    Slot(Slot),
-    /// C's own state, with the initial value of an input (`.v`) or 0 (`.`).
-    Own(f64),
-}
+const _: () = assert!(WARM + CALLS <= BEYOND, "a round does not leave the input sequence");
 
 fn main() {
     let leads: [usize; PLACES] = std::array::from_fn(|place| 16 + 1040 * place);
     let [libraries, calls] = ["library/models.c", "library/calls.c"].map(|source| gcc::built_at(source, leads));
     let around = calls.each_ref().map(Around::of);
-    let hands = libraries.each_ref().map(|library| {
-        // SAFETY: the table is in the source.
-        unsafe { library.get::<*const Hand>(b"models") }.expect("the source has a table")
-    });
-    let hand = |hands: &libloading::Symbol<*const Hand>, name: &str| {
-        // SAFETY: the table ends with an entry without a name.
-        let mut entries = (0..).map(|k| unsafe { &*(**hands).add(k) }).take_while(|hand| !hand.name.is_null());
-        entries.find(|hand| words(hand.name) == [name])
-    };
+    let hands = libraries.each_ref().map(hand::hands);
     let chosen = std::env::args().skip(1).find(|word| !word.starts_with('-')).unwrap_or_default();
     let modules = project::Disk.modules();
     let texts = modules.iter().filter_map(|module| project::Disk.library(module)).flatten();
@@ -141,12 +87,10 @@ fn main() {
             left_out.push(format!("{name}: {why}"));
             continue;
         }
-        let found = hands.each_ref().map(|hands| hand(hands, name));
-        if found.iter().any(Option::is_none) {
-            left_out.push(format!("{name}: models.c has no C for it yet"));
-            continue;
-        }
-        let hands = found.map(|hand| hand.expect("each place has it"));
+        let hands = hands.each_ref().map(|hands| {
+            let found = hands.iter().find(|hand| hand.name() == *name).copied();
+            found.unwrap_or_else(|| panic!("models.c has no C for {name}, and LEFT_OUT no reason"))
+        });
         let Times { c, c_to_c, checked, ours, bare, unprepared, c_in_turn, ours_in_turn } =
             compare(name, &mut loaded, (hands, &around));
         let of_model = [ours / c, ours / checked, bare / c, unprepared / c, ours_in_turn / c_in_turn, c_to_c];
@@ -192,12 +136,7 @@ struct Times {
 
 /// Compares a model's step with its C over the same input sequence, then times both.
 fn compare(name: &str, loaded: &mut compiler::Loaded, (hands, around): ([&Hand; PLACES], &[Around; PLACES])) -> Times {
-    let hand = hands[0];
-    // A sampled model is called at its own rate.
-    let h = match name {
-        "DriveTorqueSampled" => 0.5e-3,
-        _ => 1e-3,
-    };
+    let h = hand::step_length(name);
     let built = compiler::build(loaded, &NoSources, name, &Changes::default(), &mut Vec::new());
     let mut program = built.unwrap_or_else(|found| panic!("{name}: {found:?}")).program;
     program.size_rings(h);
@@ -208,74 +147,14 @@ fn compare(name: &str, loaded: &mut compiler::Loaded, (hands, around): ([&Hand; 
     let mut ours = Running::new(&program);
     program.description.guards.clear();
     let mut bare = Running::new(&program);
-    let description = ours.instance.description().clone();
     let (made, ours) = (ours.codes, &mut ours.instance);
-    let slots = |names: Vec<String>| -> Vec<Slot> { names.iter().map(|path| slot(&description, name, path)).collect() };
-    let inputs = slots(words(hand.inputs));
-    let layout = &description.layout;
-    assert!(
-        inputs.iter().enumerate().all(|(k, slot)| *slot == layout.inputs.slot(k))
-            && inputs.len() == layout.inputs.len as usize,
-        "{name}: inputs in the order of the text"
-    );
-    let outputs = slots(words(hand.outputs));
-    for quantity in description.quantities.iter().filter(|quantity| quantity.kind == Kind::Output) {
-        let own = !quantity.path.contains('.');
-        assert!(!own || outputs.contains(&quantity.slot), "{name} in C lacks output {}", quantity.path);
-    }
-    let course = course(&words(hand.inputs));
-    let row = |k: usize| &course[k % COURSE * inputs.len()..][..inputs.len()];
-    for instance in [&mut *ours, &mut bare.instance] {
-        instance.block_mut()[layout.inputs.range()].copy_from_slice(row(0));
-        assert_eq!(instance.start(h), 0, "{name} starts");
-    }
-    let params: Vec<f64> = slots(words(hand.params)).into_iter().map(|slot| ours.get(slot)).collect();
-    let states: Vec<State> = words(hand.states).iter().map(|path| state(&description, name, path, ours)).collect();
-    let begin = |state: &State| match state {
-        State::Slot(slot) => ours.get(*slot),
-        State::Own(begin) => *begin,
-    };
-    let mut x: Vec<f64> = states.iter().map(begin).collect();
-    for quantity in description.quantities.iter().filter(|q| matches!(q.kind, Kind::State | Kind::SampledState)) {
-        let known = states.iter().any(|state| matches!(state, State::Slot(slot) if *slot == quantity.slot));
-        assert!(known, "{name} in C lacks state {}", quantity.path);
-    }
-    let mut out = vec![0.0; outputs.len()];
-    let names = words(hand.states);
-    let own = names.iter().enumerate().filter(|(_, path)| !path.starts_with(['.', '@']));
-    let watched = own.fold(0, |all, (k, _)| all | 1 << k);
-    assert_eq!(
-        (hand.watched, hand.number_of_outputs),
-        (watched, outputs.len() as u64),
-        "{name} in C watches all states of its own and all outputs"
-    );
-
-    // The same input sequence.
-    let in_block = states.iter().enumerate().filter_map(|(k, state)| match state {
-        State::Slot(slot) => Some((k, *slot)),
-        State::Own(_) => None,
-    });
-    let in_block: Vec<(usize, Slot)> = in_block.collect();
-    let mut largest = vec![0.0f64; in_block.len() + outputs.len()];
-    for k in 1..COMPARED {
-        ours.block_mut()[layout.inputs.range()].copy_from_slice(row(k));
-        let status = ours.advance(1);
-        assert_eq!(status, 0, "{name} at step {k}: {:?}", description.guards.get(status as usize - 1));
-        // SAFETY: the arrays are as long as the names that the source gives.
-        unsafe { (hand.step)(x.as_mut_ptr(), params.as_ptr(), row(k).as_ptr(), out.as_mut_ptr(), h) };
-        let states = in_block.iter().map(|(k, slot)| (x[*k], *slot));
-        for ((c, slot), largest) in states.chain(out.iter().copied().zip(outputs.iter().copied())).zip(&mut largest) {
-            let own = ours.get(slot);
-            *largest = largest.max(own.abs());
-            let path = || description.quantities.iter().find(|q| q.slot == slot).map_or("?", |q| q.path.as_str());
-            assert!(
-                (c - own).abs() <= TOLERANCE * *largest,
-                "{name} at step {k}, inputs {:?}: {} is {own:e}, in C {c:e}",
-                row(k),
-                path()
-            );
-        }
-    }
+    let refused = |why: String| -> ! { panic!("{why}") };
+    let mut pair = Pair::new(name, hands[0], ours).unwrap_or_else(|why| refused(why));
+    let inputs = ours.description().layout.inputs.range();
+    bare.instance.block_mut()[inputs.clone()].copy_from_slice(&pair.course[..inputs.len()]);
+    assert_eq!(bare.instance.start(h), 0, "{name} starts without guards");
+    pair.agrees(ours, COMPARED).unwrap_or_else(|why| refused(why));
+    let Pair { x, params, course, inputs, outputs, .. } = pair;
     let ways = [Way::of(&made, ours), Way::of(&bare.codes, &bare.instance), Way::of(&contained, ours)];
     timed((hands, around), ways, &x, &params, (&course, &inputs, &outputs), h)
 }
@@ -507,53 +386,4 @@ impl Around {
         let made = |name: &[u8]| *unsafe { library.get::<Made>(name) }.expect("the source has it");
         Around { many: made(b"many"), in_turn: made(b"in_turn") }
     }
-}
-
-fn slot(description: &Description, name: &str, path: &str) -> Slot {
-    description.quantity(path).unwrap_or_else(|| panic!("{name} has no {path}")).slot
-}
-
-fn state(description: &Description, name: &str, path: &str, ours: &Instance) -> State {
-    if path == "@count" {
-        return State::Slot(Slot::COUNT);
-    }
-    if let Some(part) = path.strip_prefix("@mode") {
-        let part = part.trim_start_matches(':');
-        let automaton = description.automata.iter().find(|automaton| automaton.path == part);
-        return State::Slot(automaton.unwrap_or_else(|| panic!("{name} has no automaton `{part}`")).slot);
-    }
-    match path.strip_prefix('.') {
-        Some("") => State::Own(0.0),
-        Some(input) => State::Own(ours.get(slot(description, name, input))),
-        None => State::Slot(slot(description, name, path)),
-    }
-}
-
-/// The inputs at each instant, one after the other: through zero and over the whole working range of contacts.
-fn course(inputs: &[String]) -> Vec<f64> {
-    let mut course = Vec::new();
-    // The sequence repeats; a round that begins near the end continues with its first rows.
-    for k in (0..COURSE).chain(0..WARM + CALLS) {
-        for (number, input) in inputs.iter().enumerate() {
-            let angle = std::f64::consts::TAU * k as f64 / COURSE as f64;
-            // The platform's sine is good enough for inputs.
-            #[allow(clippy::disallowed_methods)]
-            let wave = |cycles: f64| (cycles * angle + 0.3 + number as f64).sin();
-            let mixed = 0.7 * wave(7.0) + 0.3 * wave(31.0);
-            course.push(match input.as_str() {
-                "v" | "v_d" => 5e-3 * mixed,
-                "de" => 1e-3 * mixed,
-                "v0" => 1e-3 + 0.5e-3 * mixed,
-                "limit" => 0.4 + 0.1 * mixed,
-                "e" => 20e-6 * mixed,
-                "r" | "y" | "x" => 3e-3 * mixed,
-                "rest" => 1.5 + mixed,
-                "Fn" | "F_l" | "Fl" => 1.5 + mixed,
-                "T" => 50.0 + 40.0 * mixed,
-                "u" | "u_in" | "F_ext" | "F_m" | "F_e" | "F_motor" | "F_load" => 2.0 * mixed,
-                other => panic!("what does the input `{other}` do?"),
-            });
-        }
-    }
-    course
 }

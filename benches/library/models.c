@@ -110,14 +110,6 @@ static void GearM6(ARGS) {
     double dry = p[1] + fabs(p[2] * Fm - p[3] * Fe) + S * (p[4] + fabs(p[5] * Fm - p[6] * Fe) + Q);
     o[0] = p[0] * v + dry * sgn(v);
 }
-static void Karnopp(ARGS) {
-    STATELESS;
-    double v = u[0], F_ext = u[1], Fc = p[0], Fs = p[1], Fv = p[2], Dv = p[3];
-    int stuck = fabs(v) < Dv;
-    o[0] = stuck;
-    o[1] = stuck ? clamp(F_ext + Fs / Dv * v, -Fs, Fs) : Fc * sgn(v) + Fv * v;
-    o[2] = stuck ? 0 : v;
-}
 static void KFMSmooth(ARGS) {
     STATELESS;
     double v = u[0];
@@ -277,11 +269,12 @@ static void Dahl(ARGS) {
     o[0] = x[1];
 }
 static void DahlPower(ARGS) {
-    double v = u[0], Fc = p[0], sigma = p[1], i = p[2], s = sgn(v), m = x[0], f = 0, a = 0;
+    double v = u[0], Fc = p[0], sigma = p[1], i = p[2], near = i < 1 ? 1e-6 : 1e-12; /* a straight line below `near` */
+    double s = sgn(v), m = x[0], f = 0, a = 0;
     for (int k = 0; k < 4; k++) {
-        double gap = 1 - m / Fc * s, size = fabs(gap), below = pow(size, i - 1);
+        double gap = 1 - m / Fc * s, size = fabs(gap), below = pow(fmax(size, near), i - 1);
         f = sigma * below * gap * v;
-        a = fmin(-sigma * i * below * v * s / Fc, 0) * (gap != 0);
+        a = fmin(-sigma * (size > near ? i : 1) * below * v * s / Fc, 0);
         f += a * (x[0] - m);
         if (k < 3)
             m = mean(x[0], f, a, h);
@@ -435,6 +428,13 @@ static void GMS(ARGS) {
     x[8] = v;
     o[0] = x[0] + x[2] + x[4] + x[6] + p[5] * v;
 }
+static void GMS4(ARGS) {
+    double v = u[0], g = stribeck2(v, p[0], p[1], p[2]); /* Fc Fs vs Fv; k, share, C of each element */
+    for (int i = 0; i < 4; i++)
+        gms_element(&x[2 * i], &x[2 * i + 1], x[8], v, p[4 + i], p[12 + i], p[8 + i] * g, h);
+    x[8] = v;
+    o[0] = x[0] + x[2] + x[4] + x[6] + p[3] * v;
+}
 static inline void maxwell_element(double *f, double *mode, double v, double k, double W, double h) {
     if (*mode == STICK) {
         *f += h * k * v;
@@ -454,19 +454,26 @@ static void MaxwellSlip(ARGS) {
         maxwell_element(&x[2 * i], &x[2 * i + 1], u[0], p[0] / (i + 1), p[1] / 4, h);
     o[0] = x[0] + x[2] + x[4] + x[6];
 }
-static void LeuvenModified(ARGS) {
-    double v = u[0], n = p[2], W = p[1] / 4, g = stribeck2(v, p[5], p[6], p[7]), s = sgn(v);
-    double f[4] = {x[1], x[3], x[5], x[7]}, r[4] = {0}, a[4] = {0}, zm = 0, k[4];
+static void MaxwellSlip4(ARGS) {
     for (int i = 0; i < 4; i++)
-        k[i] = x[2 * i + 2] == STICK ? p[0] / (i + 1) : 0;
+        maxwell_element(&x[2 * i], &x[2 * i + 1], u[0], p[i], p[4 + i], h);
+    o[0] = x[0] + x[2] + x[4] + x[6];
+}
+/* z, and f and mode of each spring, with its stiffness k and its force W; g: the Stribeck curve; returns the force
+ * without its viscous part */
+static inline double leuven(double *restrict x, const double *k, const double *W, double v, double g, double n,
+                            double sigma1, double h) {
+    double s = sgn(v), f[4] = {x[1], x[3], x[5], x[7]}, r[4] = {0}, a[4] = {0}, zm = 0, stuck[4];
+    for (int i = 0; i < 4; i++)
+        stuck[i] = x[2 * i + 2] == STICK ? k[i] : 0;
     double m[4] = {f[0], f[1], f[2], f[3]};
     for (int round = 0; round < 4; round++) {
         double q = (m[0] + m[1] + m[2] + m[3]) / g * s, below = pow(fabs(q), n - 1);
         double slope = -v * n * below * sq(sgn(q)) * s / g;
         zm = v * (1 - below * q);
         for (int i = 0; i < 4; i++) {
-            a[i] = fmin(k[i] * slope, 0);
-            r[i] = k[i] * zm + a[i] * (f[i] - m[i]);
+            a[i] = fmin(stuck[i] * slope, 0);
+            r[i] = stuck[i] * zm + a[i] * (f[i] - m[i]);
             if (round < 3)
                 m[i] = mean(f[i], r[i], a[i], h);
         }
@@ -480,17 +487,45 @@ static void LeuvenModified(ARGS) {
     for (int i = 0; i < 4; i++) {
         double *mode = &x[2 * i + 2];
         if (*mode == STICK) {
-            if (f[i] > W && zv > 0)
-                f[i] = W, *mode = PLUS;
-            else if (f[i] < -W && zv < 0)
-                f[i] = -W, *mode = MINUS;
+            if (f[i] > W[i] && zv > 0)
+                f[i] = W[i], *mode = PLUS;
+            else if (f[i] < -W[i] && zv < 0)
+                f[i] = -W[i], *mode = MINUS;
         } else if (*mode == PLUS ? zv < 0 : zv > 0)
             *mode = STICK;
         x[2 * i + 1] = f[i];
     }
     sum = f[0] + f[1] + f[2] + f[3];
     q = sum / g * s, zv = v * (1 - pow(fabs(q), n - 1) * q);
-    o[0] = sum + p[3] * zv + p[4] * v;
+    return sum + sigma1 * zv;
+}
+static void LeuvenModified(ARGS) {
+    double k0 = p[0], W = p[1] / 4, v = u[0]; /* k0 Wh n sigma1 sigma2 Fc Fs vs */
+    double k[4] = {k0, k0 / 2, k0 / 3, k0 / 4}, all[4] = {W, W, W, W};
+    o[0] = leuven(x, k, all, v, stribeck2(v, p[5], p[6], p[7]), p[2], p[3], h) + p[4] * v;
+}
+static void LeuvenModified4(ARGS) {
+    double v = u[0]; /* n sigma1 sigma2 Fc Fs vs, k, W */
+    o[0] = leuven(x, p + 6, p + 10, v, stribeck2(v, p[3], p[4], p[5]), p[0], p[1], h) + p[2] * v;
+}
+static void Karnopp(ARGS) {
+    UNUSED(h);
+    double v = u[0], F_ext = u[1], Fc = p[0], Fs = p[1], Fv = p[2], Dv = p[3];
+    if (x[0] == STICK)
+        x[0] = v >= Dv ? PLUS : v <= -Dv ? MINUS : STICK;
+    else if (x[0] == PLUS ? v < Dv : v > -Dv)
+        x[0] = STICK;
+    int stuck = x[0] == STICK;
+    o[0] = stuck ? clamp(F_ext + Fs / Dv * v, -Fs, Fs) : (x[0] == PLUS ? Fc : -Fc) + Fv * v;
+    o[1] = stuck ? 0 : v;
+}
+static void KarnoppPublished(ARGS) {
+    UNUSED(h);
+    double v = u[0], Fs = p[1];
+    int slides = fabs(v) >= p[3];
+    x[0] = slides;
+    o[0] = slides ? p[0] * sgn(v) + p[2] * v : clamp(u[1], -Fs, Fs);
+    o[1] = slides ? v : 0;
 }
 /* Held, or sliding one way: what kinetic friction with exact rest shares. */
 static inline void hold(double *slip, double *mode, double v, double F_ext, double Fs, double v_hold, double x_hold) {
@@ -521,17 +556,18 @@ static void KFMDwell(ARGS) {
     o[1] = x[2] == STICK ? clamp(F_ext + p[5] * v, -Fs, Fs) : (x[2] == PLUS ? Fc : -Fc) + p[2] * v;
 }
 static void Sticking(ARGS) {
-    double v = u[0], F_ext = u[1], v_min = p[4], Fs = 0; /* peak B v_hold x_hold v_min; Fc Fs vs Fv of the law */
+    /* peak peak_back B v_hold x_hold v_min; Fc Fs vs Fv of the law. Unless it is set, peak_back is peak. */
+    double v = u[0], F_ext = u[1], v_min = p[5], Fs = 0, peak = F_ext >= 0 ? p[0] : p[1];
     double beside = F_ext >= 0 ? v_min : -v_min;
-#define LAW(w) (stribeck2(w, p[5], p[6], p[7]) * sgn(w) + p[8] * (w))
+#define LAW(w) (stribeck2(w, p[6], p[7], p[8]) * sgn(w) + p[9] * (w))
     if (x[1] == STICK) {
         x[0] += h * v;
-        Fs = p[0] * fabs(LAW(beside));
+        Fs = peak * fabs(LAW(beside));
     }
-    hold(&x[0], &x[1], v, F_ext, Fs, p[2], p[3]);
+    hold(&x[0], &x[1], v, F_ext, Fs, p[3], p[4]);
     if (x[1] == STICK) {
-        Fs = p[0] * fabs(LAW(beside));
-        o[0] = clamp(F_ext + p[1] * v, -Fs, Fs);
+        Fs = peak * fabs(LAW(beside));
+        o[0] = clamp(F_ext + p[2] * v, -Fs, Fs);
     } else {
         double w = x[1] == PLUS ? fmax(v, v_min) : fmin(v, -v_min);
         o[0] = LAW(w);
@@ -670,6 +706,14 @@ static void Dither(ARGS) {
     x[0] += 1;
     o[0] = u[0] + p[0] * sin(6.283185307179586 * p[1] * (x[0] * h));
 }
+static void SineProfile(ARGS) {
+    UNUSED(u);
+    x[0] += 1; /* count */
+    double A = 0.5 * p[0], w = 6.283185307179586 * p[1], angle = w * (x[0] * h), s = sin(angle), c = cos(angle);
+    o[0] = A * (1 - c);
+    o[1] = A * w * s;
+    o[2] = A * w * w * c;
+}
 static void Knocker(ARGS) {
     double want = u[0]; /* u_last count height begun */
     x[1] += 1;
@@ -699,18 +743,30 @@ static void Lag(ARGS) {
 }
 static void KFMClip(ARGS) {
     double v = u[0], F_ext = u[1], Fc = p[0], Fs = p[1], Fv = p[2], m = p[3], Ts = p[4];
-    x[0] += 1;
+    x[0] += 1; /* count rests F */
     if (due(x[0], Ts, h)) {
-        int rest = fabs(v) < p[5];
-        double next = 0;
-        if (!(rest && fabs(F_ext) <= Fs)) {
-            double dir = rest ? sgn(F_ext) : sgn(v);
-            double slid = (v + Ts * F_ext / m - dir * Ts * Fc / m) / (1 + Ts * Fv / m);
-            next = slid * dir <= 0 ? 0 : slid;
-        }
-        x[1] = F_ext - m * (next - v) / Ts;
+        int rests = x[1] != 0 || fabs(v) < p[5];
+        double pull = F_ext + m * v / Ts, dir = rests ? sgn(pull) : sgn(v);
+        double slid = (v + Ts * F_ext / m - dir * Ts * Fc / m) / (1 + Ts * Fv / m);
+        int stops = (rests && fabs(pull) <= Fs) || slid * dir <= 0;
+        x[1] = stops;
+        x[2] = F_ext - m * ((stops ? 0 : slid) - v) / Ts;
     }
+    o[0] = x[2];
+}
+static void SampleHold(ARGS) {
+    x[0] += 1; /* count y */
+    if (due(x[0], p[0], h))
+        x[1] = u[0];
     o[0] = x[1];
+}
+static void UnitDelay(ARGS) {
+    x[1] += 1; /* last count y */
+    if (due(x[1], p[0], h)) {
+        x[2] = x[0];
+        x[0] = u[0];
+    }
+    o[0] = x[2];
 }
 
 /* ---- observers ---- */
@@ -727,21 +783,65 @@ static void DisturbanceObserver2(ARGS) {
     x[1] += h * c * (m - push - x[1]) / T;
     o[0] = x[1];
 }
+/* Linear systems by the matrix exponential: the Taylor series of the step, each term from the one before, c1 = h f,
+ * ck+1 = h A ck/(k + 1). Where its last term is not small, h A is too large for it, and the step is iterated. */
+enum { TERMS = 16 };
+static const double over[TERMS + 1] = {0, 1, 1. / 2, 1. / 3, 1. / 4, 1. / 5, 1. / 6, 1. / 7, 1. / 8, 1. / 9, 1. / 10,
+                                       1. / 11, 1. / 12, 1. / 13, 1. / 14, 1. / 15, 1. / 16};
+static inline int small(double term, double size) { return fabs(term) <= 1e-6 * size; }
+
 static void ExtendedStateObserver(ARGS) {
-    double y = u[0], w = p[1], a = u[1] / p[0], c2 = phi2(-3 * w * h), m1 = x[0], m2 = x[1], m3 = x[2], f1 = 0, f2 = 0, f3 = 0;
-    for (int k = 0; k < 4; k++) {
-        double d = y - m1;
-        f1 = m2 + 3 * w * (y - x[0]);
-        f2 = m3 + a + 3 * w * w * d;
-        f3 = w * w * w * d;
-        if (k < 3)
-            m1 = x[0] + h * c2 * f1, m2 = x[1] + 0.5 * h * f2, m3 = x[2] + 0.5 * h * f3;
+    double y = u[0], w = p[1], a = u[1] / p[0], d = y - x[0], q1 = 3 * w * h, q2 = 3 * w * w * h, q3 = w * w * w * h;
+    double t1 = h * x[1] + q1 * d, t2 = h * (x[2] + a) + q2 * d, t3 = q3 * d;
+    double e1 = t1, e2 = t2, e3 = t3, s1 = fabs(t1), s2 = fabs(t2), s3 = fabs(t3);
+    for (int k = 2; k <= TERMS; k++) {
+        double n1 = over[k] * (h * t2 - q1 * t1), n2 = over[k] * (h * t3 - q2 * t1);
+        t3 = over[k] * -q3 * t1, t1 = n1, t2 = n2;
+        e1 += t1, e2 += t2, e3 += t3;
+        s1 += fabs(t1), s2 += fabs(t2), s3 += fabs(t3);
     }
-    x[0] = relaxed(x[0], f1, -3 * w, h);
-    x[1] += h * f2;
-    x[2] += h * f3;
+    if (small(t1, s1) && small(t2, s2) && small(t3, s3)) {
+        x[0] += e1, x[1] += e2, x[2] += e3;
+    } else {
+        double c2 = phi2(-3 * w * h), m1 = x[0], m2 = x[1], m3 = x[2], f1 = 0, f2 = 0, f3 = 0;
+        for (int k = 0; k < 4; k++) {
+            d = y - m1;
+            f1 = m2 + 3 * w * (y - x[0]);
+            f2 = m3 + a + 3 * w * w * d;
+            f3 = w * w * w * d;
+            if (k < 3)
+                m1 = x[0] + h * c2 * f1, m2 = x[1] + 0.5 * h * f2, m3 = x[2] + 0.5 * h * f3;
+        }
+        x[0] = relaxed(x[0], f1, -3 * w, h);
+        x[1] += h * f2;
+        x[2] += h * f3;
+    }
     o[0] = x[1];
     o[1] = -p[0] * x[2];
+}
+static void SpeedObserver(ARGS) {
+    double y = u[0], w = p[0], d = y - x[0], q1 = 2 * w * h, q2 = w * w * h;
+    double t1 = h * x[1] + q1 * d, t2 = q2 * d, e1 = t1, e2 = t2, s1 = fabs(t1), s2 = fabs(t2);
+    for (int k = 2; k <= TERMS; k++) {
+        double n1 = over[k] * (h * t2 - q1 * t1);
+        t2 = over[k] * -q2 * t1, t1 = n1;
+        e1 += t1, e2 += t2;
+        s1 += fabs(t1), s2 += fabs(t2);
+    }
+    if (small(t1, s1) && small(t2, s2)) {
+        x[0] += e1, x[1] += e2;
+    } else {
+        double c2 = phi2(-2 * w * h), m1 = x[0], m2 = x[1], f1 = 0, f2 = 0;
+        for (int k = 0; k < 4; k++) {
+            f1 = m2 + 2 * w * (y - x[0]);
+            f2 = w * w * (y - m1);
+            if (k < 3)
+                m1 = x[0] + h * c2 * f1, m2 = x[1] + 0.5 * h * f2;
+        }
+        x[0] = relaxed(x[0], f1, -2 * w, h);
+        x[1] += h * f2;
+    }
+    o[0] = x[1];
 }
 static void FriedlandPark(ARGS) {
     double v = u[0], m = p[0], k = p[1], v1 = p[3], s = sgn(v), r = fabs(v / v1), below = pow(r, p[2] - 1);
@@ -749,18 +849,6 @@ static void FriedlandPark(ARGS) {
     x[0] = relaxed(x[0], c * (u[1] / m - (x[0] - offset) * s) * s, -c * s * s, h);
     o[0] = m * (x[0] - offset);
     o[1] = o[0] * s;
-}
-static void SpeedObserver(ARGS) {
-    double y = u[0], w = p[0], c2 = phi2(-2 * w * h), m1 = x[0], m2 = x[1], f1 = 0, f2 = 0;
-    for (int k = 0; k < 4; k++) {
-        f1 = m2 + 2 * w * (y - x[0]);
-        f2 = w * w * (y - m1);
-        if (k < 3)
-            m1 = x[0] + h * c2 * f1, m2 = x[1] + 0.5 * h * f2;
-    }
-    x[0] = relaxed(x[0], f1, -2 * w, h);
-    x[1] += h * f2;
-    o[0] = x[1];
 }
 
 /* ---- plants ---- */
@@ -771,8 +859,70 @@ static void Axis(ARGS) {
     x[0] += h * (x[1] + 0.5 * h * a);
     x[1] += h * a;
 }
+static void BandedAxis(ARGS) {
+    double a = (u[0] - u[1]) / p[0], half = x[1] + 0.5 * h * a, Dv = p[1];
+    if (fabs(half) >= Dv)
+        x[0] += h * half;
+    x[1] += h * a;
+    o[0] = fabs(x[1]) < Dv ? 0 : x[1];
+}
+static inline double stop(double x, double v, double low, double high, double k, double d) {
+    return x > high ? fmax(k * (x - high) + d * v, 0) : x < low ? fmin(k * (x - low) + d * v, 0) : 0;
+}
+static void EndStops(ARGS) {
+    STATELESS;
+    o[0] = u[0] > p[1] || u[0] < p[0];
+    o[1] = stop(u[0], u[1], p[0], p[1], p[2], p[3]);
+}
+static void StoppedAxis(ARGS) {
+    double m = p[0], k = p[3], d = p[4], mx = x[0], mv = x[1], fx = 0, fv = 0, a = 0; /* m low high k d */
+    for (int round = 0; round < 4; round++) {
+        double F = stop(mx, mv, p[1], p[2], k, d);
+        a = F != 0 ? -d / m : 0;
+        fx = mv;
+        fv = (u[0] - F) / m + a * (x[1] - mv);
+        if (round < 3)
+            mx = x[0] + 0.5 * h * fx, mv = mean(x[1], fv, a, h);
+    }
+    o[0] = x[0] += h * fx;
+    o[1] = x[1] = relaxed(x[1], fv, a, h);
+}
+/* Two masses with `KFM` between them. Where they come to rest on each other, they go on with their common momentum, and
+ * so they do where the speed is what the rounding of the force makes in a step. */
+static void Clutch(ARGS) {
+    double F1 = u[0], F2 = u[1], m1 = p[0], m2 = p[1], Fc = p[2], Fs = p[3], Fv = p[4], B = p[5];
+    double F_ext = (m2 * F1 - m1 * F2) / (m1 + m2), both = 1 / m1 + 1 / m2; /* x1 v1 x2 v2 slip mode */
+    int stuck = x[5] == STICK;
+    double dry = x[5] == PLUS ? Fc : -Fc, n1 = x[1], n2 = x[3], f1 = 0, f2 = 0, a1 = 0, a2 = 0;
+#define FORCE(v) (stuck ? clamp(F_ext + B * (v), -Fs, Fs) : dry + Fv * (v))
+    for (int round = 0; round < 4; round++) {
+        double v = n1 - n2, F = FORCE(v), slope = stuck ? (fabs(F_ext + B * v) < Fs ? B : 0) : Fv;
+        a1 = -slope / m1, a2 = -slope / m2;
+        f1 = (F1 - F) / m1 + a1 * (x[1] - n1);
+        f2 = (F2 + F) / m2 + a2 * (x[3] - n2);
+        if (round < 3)
+            n1 = mean(x[1], f1, a1, h), n2 = mean(x[3], f2, a2, h);
+    }
+    x[0] += h * n1;
+    x[1] = relaxed(x[1], f1, a1, h);
+    x[2] += h * n2;
+    x[3] = relaxed(x[3], f2, a2, h);
+    if (stuck)
+        x[4] += h * (n1 - n2);
+    double v = x[1] - x[3], F = FORCE(v);
+    hold(&x[4], &x[5], v, F_ext, Fs, p[6], p[7]);
+    if ((!stuck && x[5] == STICK) || fabs(v) <= 0x1p-20 * fabs(h * both * F)) {
+        x[1] -= v / both / m1;
+        x[3] += v / both / m2;
+    }
+    stuck = x[5] == STICK;
+    dry = x[5] == PLUS ? Fc : -Fc;
+    o[0] = v = x[1] - x[3];
+    o[1] = FORCE(v);
+#undef FORCE
+}
 static void DriveTorque(ARGS) {
-    double T = p[3], sent = p[1] * floor(clamp(u[0], -p[0], p[0]) / p[1] + 0.5);
+    double T = p[3], wanted = clamp(u[0], -p[0], p[0]), q = p[1], sent = q > 0 ? q * floor(wanted / q + 0.5) : wanted;
     double *ring = x + 2, back = p[2] / h - 0.5, demand; /* F count, 128 samples of what was sent */
     int64_t count = (int64_t)x[1];
     if (back < 0) {
@@ -794,8 +944,9 @@ static void DriveTorqueSampled(ARGS) {
     x[0] = relaxed(x[0], (x[3] - x[0]) / T, -1 / T, h);
     x[2] += 1;
     if (due(x[2], p[3], h)) {
+        double wanted = clamp(u[0], -p[0], p[0]), q = p[1];
         x[3] = x[1];
-        x[1] = p[1] * floor(clamp(u[0], -p[0], p[0]) / p[1] + 0.5);
+        x[1] = q > 0 ? q * floor(wanted / q + 0.5) : wanted;
     }
     o[0] = x[3];
 }
@@ -839,10 +990,11 @@ static void TwoMass(ARGS) {
 /* ---- all of them, with the names of their ports ---- */
 
 #define EIGHT(word) word word word word word word word word
+#define FOUR(of, name) of "e1." name " @mode:" of "e1 " of "e2." name " @mode:" of "e2 " of "e3." name " @mode:" of "e3 " of "e4." name " @mode:" of "e4"
 #define ELEMENTS(name) "el[1]." name " @mode:el[1] el[2]." name " @mode:el[2] el[3]." name " @mode:el[3] el[4]." name " @mode:el[4]"
 
-/* Name; which states are watched, a bit each, and the number of outputs; then the names of all ports. Behind a `.` stands
- * an input with which a state of our own begins; `@` are counter and regimes. */
+/* Name; which states have guards, a bit each, and the number of outputs; then the names of all ports. A state of our own
+ * is a `.`, followed by the input with whose value it begins; `@` are counter and regimes. */
 #define MODELS(MODEL) \
     MODEL(Ambrosio, 0x0u, 1, "v", "Fc v0 v1", "", "F") \
     MODEL(Asymmetric, 0x0u, 1, "v", "F0 pos.Fc pos.Fs pos.vs pos.Fv neg.Fc neg.Fs neg.vs neg.Fv", "", "F") \
@@ -857,7 +1009,6 @@ static void TwoMass(ARGS) {
     MODEL(GearM4, 0x0u, 1, "v F_m F_e", "Kv Kc Kl Kcs Kls vs alpha", "", "F") \
     MODEL(GearM5, 0x0u, 1, "v F_m F_e", "Kv Kc Km Ke Kcs Kms Kes vs alpha", "", "F") \
     MODEL(GearM6, 0x0u, 1, "v F_m F_e", "Kv Kc Km Ke Kcs Kms Kes Keq Kmq vs alpha", "", "F") \
-    MODEL(Karnopp, 0x0u, 3, "v F_ext", "Fc Fs Fv Dv", "", "stuck F v_out") \
     MODEL(KFMSmooth, 0x0u, 1, "v", "Fc Fs Fv v0 vs", "", "F") \
     MODEL(HyperbolicAgeing, 0x0u, 1, "rest", "gamma", "", "share") \
     MODEL(ExponentialAgeing, 0x0u, 1, "rest", "tau n", "", "share") \
@@ -897,12 +1048,17 @@ static void TwoMass(ARGS) {
     MODEL(Armstrong, 0x7u, 2, "v", "kt Fc Fv E_inf vs tau_L gamma", "x t2 Ea @mode @count " EIGHT(EIGHT(" .v .v .v .v")), "F_max F") \
     MODEL(GMSElement, 0x1u, 1, "v limit", "k C", "f @mode .v", "F") \
     MODEL(GMS, 0x55u, 1, "v", "Fc Fs vs k0 C Fv", ELEMENTS("f") " .v", "F") \
+    MODEL(GMS4, 0x55u, 1, "v", "Fc Fs vs Fv k1 k2 k3 k4 a1 a2 a3 a4 C1 C2 C3 C4", FOUR("", "f") " .v", "F") \
     MODEL(MaxwellElement, 0x1u, 1, "v", "k W", "f @mode", "F") \
     MODEL(MaxwellSlip, 0x55u, 1, "v", "k0 Fc", ELEMENTS("f"), "F") \
+    MODEL(MaxwellSlip4, 0x55u, 1, "v", "k1 k2 k3 k4 W1 W2 W3 W4", FOUR("", "f"), "F") \
     MODEL(LeuvenModified, 0xabu, 1, "v", "k0 Wh n sigma1 sigma2 Fc Fs vs", "z " ELEMENTS("f"), "F") \
+    MODEL(LeuvenModified4, 0xabu, 1, "v", "n sigma1 sigma2 Fc Fs vs k1 k2 k3 k4 W1 W2 W3 W4", "z " FOUR("Fh.", "f"), "F") \
+    MODEL(Karnopp, 0x0u, 2, "v F_ext", "Fc Fs Fv Dv", "@mode", "F v_out") \
+    MODEL(KarnoppPublished, 0x0u, 2, "v F_ext", "Fc Fs Fv Dv", "@mode", "F v_out") \
     MODEL(KFM, 0x1u, 1, "v F_ext", "Fc Fs Fv B v_hold x_hold", "slip @mode", "F") \
     MODEL(KFMDwell, 0x3u, 2, "v F_ext", "Fc Fs Fv gamma rested B v_hold x_hold", "slip dwell @mode", "F_max F") \
-    MODEL(Sticking, 0x1u, 1, "v F_ext", "peak B v_hold x_hold v_min law.Fc law.Fs law.vs law.Fv", "slip @mode", "F") \
+    MODEL(Sticking, 0x1u, 1, "v F_ext", "peak peak B v_hold x_hold v_min law.Fc law.Fs law.vs law.Fv", "slip @mode", "F") \
     MODEL(ResetIntegrator, 0x1u, 1, "v", "sigma0 sigma1 z0 a", "z @mode", "F") \
     MODEL(BristleMass, 0x3u, 1, "v", "sigma0 sigma1 mb Fc Fs vs Fv", "z s @mode", "F") \
     MODEL(BristleElement, 0x3u, 1, "x", "sigma delta seed", "b n", "F") \
@@ -914,24 +1070,31 @@ static void TwoMass(ARGS) {
     MODEL(CascadeDiscrete, 0x5u, 1, "r y v", "Kx Kv Tv v_max u_max Ts", "i @count u", "u") \
     MODEL(FeedForward, 0x0u, 1, "v_d", "share law.Fc law.Fs law.Fv law.vs", "", "u") \
     MODEL(Dither, 0x0u, 1, "u_in", "A f", "@count", "u") \
+    MODEL(SineProfile, 0x0u, 3, "", "A f", "@count", "r v a") \
     MODEL(Knocker, 0xdu, 3, "u_in e", "a width period e0", "u_last @count height begun", "height begun u") \
     MODEL(AdaptiveCoulomb, 0x1u, 1, "e de v_d", "gamma lambda a_max", "a", "u") \
     MODEL(StictionPush, 0x0u, 1, "e v", "Fs Dv e0", "", "u") \
     MODEL(Lag, 0x1u, 0, "u", "T", "y", "") \
-    MODEL(KFMClip, 0x2u, 1, "v F_ext", "Fc Fs Fv m h v_rest", "@count F", "F") \
+    MODEL(KFMClip, 0x6u, 1, "v F_ext", "Fc Fs Fv m h v_rest", "@count rests F", "F") \
+    MODEL(SampleHold, 0x2u, 1, "u", "Ts", "@count y", "y") \
+    MODEL(UnitDelay, 0x5u, 1, "u", "Ts", "last @count y", "y") \
     MODEL(DisturbanceObserver, 0x1u, 1, "v u", "m T", "q", "F_hat") \
     MODEL(DisturbanceObserver2, 0x3u, 1, "v u", "m T", "q f", "F_hat") \
     MODEL(ExtendedStateObserver, 0x7u, 2, "y u", "m w", "z1 z2 z3", "v_hat F_hat") \
     MODEL(FriedlandPark, 0x1u, 2, "v u", "m k p v1", "w", "Fc_hat F_hat") \
     MODEL(SpeedObserver, 0x3u, 1, "y", "w", "x_hat v_hat", "v") \
     MODEL(Axis, 0x3u, 0, "F_motor F_load", "m", "x v", "") \
+    MODEL(BandedAxis, 0x3u, 1, "F_motor F_load", "m Dv", "x w", "v") \
+    MODEL(EndStops, 0x0u, 2, "x v", "low high k d", "", "touches F") \
+    MODEL(StoppedAxis, 0x3u, 2, "u", "m low high k d", "body.x body.v", "x v") \
+    MODEL(Clutch, 0x1fu, 2, "F1 F2", "m1 m2 fr.Fc fr.Fs fr.Fv fr.B fr.v_hold fr.x_hold", "x1 v1 x2 v2 fr.slip @mode:fr", "v F") \
     MODEL(DriveTorque, 0x1u, 0, "u", "F_max q D T", "F @count " EIGHT(EIGHT(" . .")), "") \
     MODEL(DriveTorqueSampled, 0xbu, 1, "u", "F_max q T Ts", "F read @count demand", "demand") \
     MODEL(Encoder, 0xdu, 2, "x", "count Ts", "y_old @count y v", "y v") \
     MODEL(TwoMass, 0xfu, 1, "F_motor F_load", "m1 m2 k d gap", "x1 v1 x2 v2", "F_shaft")
 
-/* The same step with what ours does at each call besides: it gives back 0 if all states and outputs are finite. Of
- * something infinite or NaN the sum is that too, and less itself NaN, whose bits are not 0: nothing is asked. */
+/* The same step with guards: returns 0 if all states and outputs are finite. A sum with an infinity or a NaN is not
+ * finite, and less itself it is NaN, whose bits are not 0: no branch is needed. */
 #define CHECKED(name, watched, outputs, ...)                                                                           \
     __attribute__((flatten)) static int64_t name##_checked(ARGS) {                                                     \
         double sum = -0.0;                                                                                             \
