@@ -20,6 +20,7 @@ use crate::codegen::select_to_branch::BranchRegions;
 use crate::codegen::sink::sink;
 use crate::codegen::specialise_modes::{Automaton, Case, Modes, Specialised, Terminator, modes, specialise};
 use crate::codegen::unswitch::{assuming, unswitchable};
+use crate::ir::variance::{self, Slots};
 use crate::ir::{Func, Op, Type, Value, Write, sign_of, verify};
 use abi::Slot;
 use cranelift_codegen::ir::condcodes::{FloatCC, IntCC};
@@ -484,31 +485,23 @@ impl Facts {
 
     /// Analyses a function, some of whose loads read distributed values.
     fn with_distributed(func: &Func, distributed: Option<Distributed>) -> Facts {
-        let stored: HashMap<_, _> = func.stores.iter().copied().collect();
-        let mut is_variant = vec![false; func.ops.len()];
+        let slots = Slots::new(func.stores.iter().map(|(slot, _)| *slot), None)
+            .with_values_of_time(distributed.map(|distributed| distributed.first));
+        let variance = variance::of_slots(func, &slots);
         let mut as_real = vec![false; func.ops.len()];
         let mut fused = vec![false; func.ops.len()];
-        for (i, op) in func.ops.iter().enumerate() {
-            let mut changes = match op {
-                Op::Load(slot) => {
-                    stored.contains_key(slot) || distributed.is_some_and(|distributed| distributed.first <= *slot)
-                }
-                Op::Ring { .. } => !func.writes.is_empty(),
-                _ => false,
-            };
+        for op in &func.ops {
             op.each_operand(|operand| {
-                changes |= is_variant[operand.index()];
                 as_real[operand.index()] |= !matches!(op, Op::ToBits(_));
                 fused[operand.index()] |= matches!(op, Op::Fma(..));
             });
-            is_variant[i] = changes;
         }
         for value in func.results() {
             as_real[value.index()] = true;
         }
         Facts {
             types: verify::types(func).expect("the function is sound"),
-            is_variant,
+            is_variant: variance.iter().map(|variance| !variance.is_invariant()).collect(),
             as_real,
             fused,
             upper_bound: upper_bound(func),

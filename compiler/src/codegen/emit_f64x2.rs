@@ -6,6 +6,7 @@
 //! them, because there are only 16 registers.
 
 use crate::codegen::emit::signature;
+use crate::codegen::loop_plan::{Line, LoopPlan, plan};
 use crate::codegen::unsupported::Unsupported;
 use crate::ir::scc::topological_order;
 use crate::ir::{Func, Op, Type, Value, verify};
@@ -38,7 +39,9 @@ pub fn emit(
     if !func.writes.is_empty() || func.ops.iter().any(|op| matches!(op, Op::Ring { .. })) {
         return Err(Unsupported("a ring of samples (delay) has no lanes".into()));
     }
-    let plan = Plan::new(func, layout, vectors);
+    let types = verify::types(func).expect("the function is sound");
+    let step = Step { func, types, vectors, plan: plan(func, layout.size(), vectors * BYTES) };
+    let plan = &step.plan;
     target.signature = signature(isa);
     target.signature.params.push(AbiParam::new(types::I64));
     let mut b = FunctionBuilder::new(target, context);
@@ -53,8 +56,9 @@ pub fn emit(
 
     let blend = isa.name() == "x64";
     let values = HashMap::new();
-    let mut line = Line {
-        plan: &plan,
+    let mut line = Emitter {
+        step: &step,
+        plan,
         b,
         block,
         pool,
@@ -66,7 +70,7 @@ pub fn emit(
         constants: Vec::new(),
     };
     line.b.switch_to_block(prepare);
-    line.write(&plan.prologue, &[], |value| plan.hoisted_place(value).into_iter().collect());
+    line.write(&plan.prologue, &[], |value| step.hoisted_place(value).into_iter().collect());
     for index in 0..plan.carried.len() {
         for k in 0..vectors {
             let number = line.load(types::F64X2, Place::Block(plan.carried[index].0), k);
@@ -95,7 +99,7 @@ pub fn emit(
         let of = plan.carried.iter().enumerate().filter(|(_, (_, next))| *next == value);
         of.map(|(index, _)| Place::After(index)).collect()
     });
-    match plan.failed {
+    match func.failed() {
         None => line.b.ins().jump(next, &[]),
         Some(failed) => {
             let mut any = line.get(failed, 0);
@@ -116,7 +120,7 @@ pub fn emit(
     line.before = before;
     line.values.clear();
     let results: Vec<Value> = func.stores.iter().map(|(_, value)| *value).chain(func.status).collect();
-    line.write(&plan.final_order, &results, |value| {
+    line.write(&plan.last, &results, |value| {
         let stores = func.stores.iter().filter(|(_, stored)| *stored == value);
         let mut places: Vec<Place> = stores.map(|(slot, _)| Place::Block(*slot)).collect();
         places.extend((func.status == Some(value)).then_some(Place::Statuses));
@@ -132,7 +136,7 @@ pub fn emit(
         line.store(constant, Place::Constant(number), 0);
     }
     line.b.ins().jump(prepare, &[]);
-    let size = plan.constants_at + line.constants.len() * BYTES;
+    let size = plan.end + line.constants.len() * BYTES;
     line.b.seal_all_blocks();
     line.b.finalize(isa.frontend_config());
     if size > i32::MAX as usize {
@@ -159,74 +163,17 @@ enum Place {
     Statuses,
 }
 
-/// The schedule of each part and the layout of the memory after the block.
-struct Plan<'a> {
+/// A step with the plan of its loop.
+struct Step<'a> {
     func: &'a Func,
     types: Vec<Type>,
     vectors: usize,
-    carried: Vec<(Slot, Value)>,
-    failed: Option<Value>,
-    hoisted: Vec<Value>,
-    prologue: Vec<Value>,
-    body: Vec<Value>,
-    final_order: Vec<Value>,
-    /// Offsets in bytes from the start of the block.
-    areas: [usize; 2],
-    hoisted_at: usize,
-    constants_at: usize,
+    plan: LoopPlan<Value>,
 }
 
-impl<'a> Plan<'a> {
-    fn new(func: &'a Func, layout: &Layout, vectors: usize) -> Plan<'a> {
-        let loaded: HashSet<Slot> = func.loads().into_iter().collect();
-        let stored: HashSet<Slot> = func.stores.iter().map(|(slot, _)| *slot).collect();
-        let carried: Vec<(Slot, Value)> =
-            func.stores.iter().copied().filter(|(slot, _)| loaded.contains(slot)).collect();
-        let failed = func.status.map(|status| match func.failure() {
-            Some((when, true, _)) => when,
-            _ => status,
-        });
-        // Without carried slots a single iteration is enough, so nothing is hoisted.
-        let mut variant = vec![carried.is_empty(); func.ops.len()];
-        for (i, op) in func.ops.iter().enumerate() {
-            variant[i] |= matches!(op, Op::Load(slot) if stored.contains(slot));
-            op.each_operand(|operand| variant[i] |= variant[operand.index()]);
-        }
-        let roots: Vec<Value> = carried.iter().map(|(_, value)| *value).chain(failed).collect();
-        let body = order(func, &roots, &variant);
-        let roots: Vec<Value> = func.stores.iter().map(|(_, value)| *value).chain(func.status).collect();
-        let final_order = order(func, &roots, &variant);
-        let read = body.iter().chain(&final_order).flat_map(|value| operands(func, *value));
-        let results = func.stores.iter().map(|(_, value)| *value).chain(func.status).chain(failed);
-        let mut seen = HashSet::new();
-        let hoisted: Vec<Value> = read
-            .chain(results)
-            .filter(|value| !variant[value.index()] && !is_leaf(func.op(*value)) && seen.insert(*value))
-            .collect();
-        let prologue = order(func, &hoisted, &variant.iter().map(|variant| !variant).collect::<Vec<_>>());
-        let vector = vectors * BYTES;
-        let areas = [0, 1].map(|area| (layout.size() + area * carried.len()) * vector);
-        let hoisted_at = areas[1] + carried.len() * vector;
-        let constants_at = hoisted_at + hoisted.len() * vector;
-        let types = verify::types(func).expect("the function is sound");
-        Plan {
-            func,
-            types,
-            vectors,
-            carried,
-            failed,
-            hoisted,
-            prologue,
-            body,
-            final_order,
-            areas,
-            hoisted_at,
-            constants_at,
-        }
-    }
-
+impl Step<'_> {
     fn hoisted_place(&self, value: Value) -> Option<Place> {
-        self.hoisted.iter().position(|known| *known == value).map(Place::Hoisted)
+        self.plan.hoisted.iter().position(|known| *known == value).map(Place::Hoisted)
     }
 }
 
@@ -260,16 +207,55 @@ fn operands(func: &Func, value: Value) -> Vec<Value> {
     operands
 }
 
-/// Orders those of the `wanted` operations that `roots` need. The operations of each root are adjacent, operands first,
-/// to keep live ranges short.
-fn order(func: &Func, roots: &[Value], wanted: &[bool]) -> Vec<Value> {
-    let is_read = |value: Value| !wanted[value.index()] || is_leaf(func.op(value));
-    topological_order(roots, func.ops.len(), Value::index, is_read, |value| operands(func, value))
+impl Line for Func {
+    type Node = Value;
+
+    fn count(&self) -> usize {
+        self.ops.len()
+    }
+
+    fn index(value: Value) -> usize {
+        value.index()
+    }
+
+    fn operands(&self, index: usize) -> Vec<Value> {
+        operands(self, Value(index as u32))
+    }
+
+    fn is_leaf(&self, value: Value) -> bool {
+        is_leaf(self.op(value))
+    }
+
+    fn load(&self, index: usize) -> Option<Slot> {
+        if let Op::Load(slot) = self.ops[index] { Some(slot) } else { None }
+    }
+
+    fn stores(&self) -> &[(Slot, Value)] {
+        &self.stores
+    }
+
+    fn status(&self) -> Option<Value> {
+        self.status
+    }
+
+    fn failed(&self) -> Option<Value> {
+        self.status.map(|status| match self.failure() {
+            Some((when, true, _)) => when,
+            _ => status,
+        })
+    }
+
+    /// The operations of each root are adjacent, operands first, to keep live ranges short.
+    fn schedule(&self, roots: &[Value], wanted: &[bool]) -> Vec<Value> {
+        let is_read = |value: Value| !wanted[value.index()] || is_leaf(self.op(value));
+        topological_order(roots, self.ops.len(), Value::index, is_read, |value| operands(self, value))
+    }
 }
 
 /// A straight line that is being emitted.
-struct Line<'a> {
-    plan: &'a Plan<'a>,
+struct Emitter<'a> {
+    step: &'a Step<'a>,
+    plan: &'a LoopPlan<Value>,
     b: FunctionBuilder<'a>,
     block: clif::Value,
     pool: clif::Value,
@@ -292,12 +278,12 @@ fn vector_of(of: Type) -> clif::Type {
     }
 }
 
-impl Line<'_> {
+impl Emitter<'_> {
     /// Emits operations; `places` says where a value is to be stored as soon as it is computed. Values of `stored_last`
     /// that are not among the operations are stored at the end.
     fn write(&mut self, order: &[Value], stored_last: &[Value], places: impl Fn(Value) -> Vec<Place>) {
         for value in order {
-            for k in 0..self.plan.vectors {
+            for k in 0..self.step.vectors {
                 let result = self.operation(*value, k);
                 self.values.entry(*value).or_default().push(result);
                 for place in places(*value) {
@@ -308,7 +294,7 @@ impl Line<'_> {
         let mut seen: HashSet<Value> = order.iter().copied().collect();
         for value in stored_last {
             if seen.insert(*value) {
-                for k in 0..self.plan.vectors {
+                for k in 0..self.step.vectors {
                     let result = self.get(*value, k);
                     places(*value).into_iter().for_each(|place| self.store(result, place, k));
                 }
@@ -318,14 +304,14 @@ impl Line<'_> {
 
     /// Base address and offset of a vector.
     fn address(&self, place: Place, k: usize) -> (clif::Value, i32) {
-        let group = |index: usize| (index * self.plan.vectors + k) * BYTES;
+        let group = |index: usize| (index * self.step.vectors + k) * BYTES;
         let (base, offset) = match place {
             Place::Block(slot) => (self.block, group(slot.index())),
             Place::Area(area, index) => (self.block, self.plan.areas[area] + group(index)),
             Place::Before(index) => (self.before, group(index)),
             Place::After(index) => (self.after, group(index)),
             Place::Hoisted(index) => (self.block, self.plan.hoisted_at + group(index)),
-            Place::Constant(number) => (self.block, self.plan.constants_at + number * BYTES),
+            Place::Constant(number) => (self.block, self.plan.end + number * BYTES),
             Place::Statuses => (self.statuses, group(0)),
         };
         // Larger code is refused at the end of `emit`.
@@ -363,11 +349,11 @@ impl Line<'_> {
     }
 
     fn get(&mut self, value: Value, k: usize) -> clif::Value {
-        let of = vector_of(self.plan.types[value.index()]);
+        let of = vector_of(self.step.types[value.index()]);
         if let Some(known) = self.values.get(&value).and_then(|vectors| vectors.get(k)) {
             return *known;
         }
-        match self.plan.func.op(value) {
+        match self.step.func.op(value) {
             Op::Real(bits) => self.constant_operand(of, bits),
             Op::Int(n) => self.constant_operand(of, n as u64),
             Op::Bool(truth) => self.constant_operand(of, if truth { u64::MAX } else { 0 }),
@@ -376,7 +362,7 @@ impl Line<'_> {
                 self.load(of, carried.map_or(Place::Block(slot), Place::Before), k)
             }
             op => {
-                let place = self.plan.hoisted_place(value).unwrap_or_else(|| panic!("{op:?} has not been computed"));
+                let place = self.step.hoisted_place(value).unwrap_or_else(|| panic!("{op:?} has not been computed"));
                 self.load(of, place, k)
             }
         }
@@ -398,9 +384,9 @@ impl Line<'_> {
     }
 
     fn operation(&mut self, value: Value, k: usize) -> clif::Value {
-        let op = self.plan.func.op(value);
-        let mut x = operands(self.plan.func, value).into_iter().map(|operand| self.get(operand, k)).collect::<Vec<_>>();
-        let of = vector_of(self.plan.types[value.index()]);
+        let op = self.step.func.op(value);
+        let mut x = operands(self.step.func, value).into_iter().map(|operand| self.get(operand, k)).collect::<Vec<_>>();
+        let of = vector_of(self.step.types[value.index()]);
         match op {
             Op::Real(_) | Op::Int(_) | Op::Bool(_) | Op::Load(_) => unreachable!("they lie in memory"),
             Op::Unary(..) | Op::Binary(..) => unreachable!("elementary functions are expanded"),
@@ -436,7 +422,7 @@ impl Line<'_> {
             }
             Op::Fma(a, b, c) => {
                 for (x, operand) in x.iter_mut().zip([a, b, c]) {
-                    if let Op::Neg(_) = self.plan.func.op(operand) {
+                    if let Op::Neg(_) = self.step.func.op(operand) {
                         *x = self.b.ins().fneg(*x);
                     }
                 }
@@ -452,8 +438,8 @@ impl Line<'_> {
                 self.b.ins().bxor(x[0], ones)
             }
             // On x86-64 a single MINPD or MAXPD, exact also for NaN and zeros.
-            Op::Select(when, a, _) if is_min_or_max(self.plan.func, op) => {
-                let Op::Less(first, _) = self.plan.func.op(when) else { unreachable!("it compares") };
+            Op::Select(when, a, _) if is_min_or_max(self.step.func, op) => {
+                let Op::Less(first, _) = self.step.func.op(when) else { unreachable!("it compares") };
                 let (low, high) = if first == a { (x[0], x[1]) } else { (x[1], x[0]) };
                 let mask = self.b.ins().fcmp(FloatCC::LessThan, low, high);
                 let mask = self.cast(of, mask);
@@ -488,11 +474,11 @@ impl Line<'_> {
 
     /// Whether an index is known to be within a table.
     fn is_in_range(&self, index: Value, len: u32) -> bool {
-        let masked = |value: Value| match self.plan.func.op(value) {
+        let masked = |value: Value| match self.step.func.op(value) {
             Op::Int(mask) => (0..i64::from(len)).contains(&mask),
             _ => false,
         };
-        match self.plan.func.op(index) {
+        match self.step.func.op(index) {
             Op::IntAnd(a, b) => masked(a) || masked(b),
             _ => masked(index),
         }

@@ -8,6 +8,7 @@
 //! Source: Aho, Lam, Sethi, Ullman, *Compilers*, 2007, sec. 9.5.
 
 use crate::ir::build::{Build, prune};
+use crate::ir::variance::{Variance, variance};
 use crate::ir::verify::types;
 use crate::ir::{Func, Op, Type, Value};
 use abi::{Layout, Slot};
@@ -25,21 +26,11 @@ impl Hoisted {
     /// Divides a step that works on blocks of this layout.
     pub fn of(func: &Func, layout: &Layout) -> Hoisted {
         let types = types(func).expect("the function is sound");
-        let mut is_invariant: Vec<bool> = Vec::with_capacity(func.ops.len());
-        for op in &func.ops {
-            is_invariant.push(match op {
-                Op::Load(slot) => layout.params.contains(*slot) || *slot == Slot::STEP,
-                Op::Ring { .. } => false,
-                op => {
-                    let mut all = true;
-                    op.each_operand(|operand| all &= is_invariant[operand.index()]);
-                    all
-                }
-            });
-        }
+        let variance = variance(func, Some(layout));
         // Neg and Abs cost less than a load; ToBits costs as much as loading the bits.
         let is_free = |op: &Op| op.effort() == 0 || matches!(op, Op::Neg(_) | Op::Abs(_) | Op::ToBits(_));
-        let is_hoisted = |at: usize| is_invariant[at] && types[at] != Type::Bool && !is_free(&func.ops[at]);
+        let is_hoisted =
+            |at: usize| variance[at] == Variance::Parameters && types[at] != Type::Bool && !is_free(&func.ops[at]);
         let all: Vec<usize> = (0..func.ops.len()).filter(|at| is_hoisted(*at)).collect();
         let first = Slot(layout.size() as u32);
         let mut remaining = func.clone();

@@ -28,6 +28,7 @@ mod emit;
 mod reroll;
 mod outline;
 mod emit_outlined;
+mod loop_plan;
 mod emit_f64x2;
 pub mod hoist_params;
 pub mod target;

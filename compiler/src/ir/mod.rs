@@ -11,6 +11,7 @@ pub mod verify;
 pub mod eval;
 pub mod build;
 pub mod partial_eval;
+pub mod variance;
 pub mod expr;
 pub mod interpret;
 pub mod program;
@@ -218,6 +219,22 @@ pub fn number_asked(asked: Op, op: impl Fn(Value) -> Op) -> Option<(Value, Slot,
     })
 }
 
+/// The values that must be available to compute an operation. The bits of a table entry are loaded directly, so they only
+/// need the index.
+pub fn reads(ops: &[Op], op: Op) -> impl Iterator<Item = Value> + use<> {
+    let mut operands = [None; 3];
+    let mut n = 0;
+    let op = match op {
+        Op::ToBits(table) if let entry @ Op::Pool { .. } = ops[table.index()] => entry,
+        op => op,
+    };
+    op.each_operand(|operand| {
+        operands[n] = Some(operand);
+        n += 1;
+    });
+    operands.into_iter().flatten()
+}
+
 /// A write to slot `base + min(index as unsigned, len − 1)` of a ring buffer, after all stores.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct Write {
@@ -321,26 +338,25 @@ impl Op {
     }
 }
 
+impl Op {
+    /// Calls `f` for each operand except the condition of a select.
+    pub fn each_data_operand(self, mut f: impl FnMut(Value)) {
+        match self {
+            Op::Select(_, yes, no) => [yes, no].into_iter().for_each(f),
+            op => op.each_operand(&mut f),
+        }
+    }
+}
+
 impl Func {
     /// The operation that defines a value.
     pub fn op(&self, value: Value) -> Op {
         self.ops[value.index()]
     }
 
-    /// The values that must be available to compute an operation. The bits of a table entry are loaded directly, so they
-    /// only need the index.
+    /// The values that must be available to compute an operation, see [`reads`].
     pub fn reads(&self, op: Op) -> impl Iterator<Item = Value> + use<> {
-        let mut operands = [None; 3];
-        let mut n = 0;
-        let op = match op {
-            Op::ToBits(table) if let Op::Pool { .. } = self.op(table) => self.op(table),
-            op => op,
-        };
-        op.each_operand(|operand| {
-            operands[n] = Some(operand);
-            n += 1;
-        });
-        operands.into_iter().flatten()
+        reads(&self.ops, op)
     }
 
     /// The condition that selects the status, its truth value in case of a failure, and the status in that case; the

@@ -104,8 +104,16 @@ fn storable(slot: Slot, layout: &Layout) -> bool {
 /// # Errors
 /// A message, if an operand does not precede its user or has the wrong type.
 pub fn types(func: &Func) -> Result<Vec<Type>, String> {
-    let mut types: Vec<Type> = Vec::with_capacity(func.ops.len());
-    for (i, &op) in func.ops.iter().enumerate() {
+    types_of(&func.ops)
+}
+
+/// As [`types`], of operations alone.
+///
+/// # Errors
+/// As `types`.
+pub fn types_of(ops: &[Op]) -> Result<Vec<Type>, String> {
+    let mut types: Vec<Type> = Vec::with_capacity(ops.len());
+    for (i, &op) in ops.iter().enumerate() {
         let value = Value(i as u32);
         let mut undefined = None;
         op.each_operand(|operand| {

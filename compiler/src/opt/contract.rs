@@ -19,9 +19,10 @@
 //! Source: Muller et al., *Handbook of Floating-Point Arithmetic*, 2018.
 
 use crate::ir::build::Build;
+use crate::ir::variance::{self, Variance};
 use crate::ir::{Func, Op, Value, is_not_negative, sign_of};
 use crate::opt::reassociate::carried;
-use abi::{Layout, Slot};
+use abi::Layout;
 
 /// Fuses every product that may be fused. `layout`: the block that the function works on.
 pub fn contract(func: &Func, layout: &Layout) -> Func {
@@ -73,22 +74,11 @@ pub fn contract(func: &Func, layout: &Layout) -> Func {
     build.finish_as(func, &values)
 }
 
-/// The most variable quantity that a value depends on.
-#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-enum DependsOn {
-    /// Only parameters, the step length and constants.
-    Parameters,
-    /// Inputs, time or delayed samples, but no result of the previous step.
-    Inputs,
-    /// Results of the previous step: the loop-carried slots.
-    PreviousStep,
-}
-
 /// How values depend on the previous step, and the next step on them. The condition of a select does not count: the
 /// analysis assumes that a branch predictor hides its latency.
 struct Dependence {
-    /// For each value, what it depends on.
-    depends_on: Vec<DependsOn>,
+    /// The variance of each value.
+    variance: Vec<Variance>,
     /// For each value, whether the next step depends on it.
     is_on_chain: Vec<bool>,
 }
@@ -96,33 +86,21 @@ struct Dependence {
 impl Dependence {
     fn of(func: &Func, layout: &Layout) -> Dependence {
         let carried = carried(func);
-        let mut depends_on: Vec<DependsOn> = Vec::with_capacity(func.ops.len());
-        for op in &func.ops {
-            depends_on.push(match *op {
-                Op::Load(slot) if carried.contains(&slot) => DependsOn::PreviousStep,
-                Op::Load(Slot::TIME | Slot::COUNT) | Op::Ring { .. } => DependsOn::Inputs,
-                Op::Load(slot) if layout.inputs.contains(slot) => DependsOn::Inputs,
-                op => data_operands(op)
-                    .into_iter()
-                    .map(|part| depends_on[part.index()])
-                    .fold(DependsOn::Parameters, DependsOn::max),
-            });
-        }
         let mut is_on_chain = vec![false; func.ops.len()];
         let stored = func.stores.iter().filter(|(slot, _)| carried.contains(slot));
         stored.for_each(|(_, value)| is_on_chain[value.index()] = true);
         for (value, op) in func.ops.iter().enumerate().rev() {
             if is_on_chain[value] {
-                data_operands(*op).into_iter().for_each(|part| is_on_chain[part.index()] = true);
+                op.each_data_operand(|part| is_on_chain[part.index()] = true);
             }
         }
-        Dependence { depends_on, is_on_chain }
+        Dependence { variance: variance::of_data(func, layout), is_on_chain }
     }
 
     /// Whether the sum is on the loop-carried chain, and only `other` depends on the previous step: `part` is ready
     /// early.
     fn is_early_addend(&self, part: Value, other: Value, sum: usize) -> bool {
-        let is_late = |value: Value| self.depends_on[value.index()] == DependsOn::PreviousStep;
+        let is_late = |value: Value| self.variance[value.index()] == Variance::State;
         self.is_on_chain[sum] && !is_late(part) && is_late(other)
     }
 
@@ -135,19 +113,13 @@ impl Dependence {
                 None => factors.push(value),
             }
         }
-        factors.sort_by_key(|value| self.depends_on[value.index()]);
+        factors.sort_by_key(|value| match self.variance[value.index()] {
+            Variance::Parameters => 0,
+            Variance::Inputs | Variance::Time | Variance::Samples => 1,
+            Variance::State => 2,
+        });
         factors
     }
-}
-
-/// The operands of an operation, without the condition of a select.
-fn data_operands(op: Op) -> Vec<Value> {
-    let mut operands = Vec::new();
-    match op {
-        Op::Select(_, yes, no) => operands.extend([yes, no]),
-        op => op.each_operand(|operand| operands.push(operand)),
-    }
-    operands
 }
 
 /// The number of uses of each value, as an operand or as a result.

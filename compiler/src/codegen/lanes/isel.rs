@@ -245,6 +245,13 @@ pub struct Nodes {
     pub pooled: bool,
 }
 
+impl Nodes {
+    /// The nodes that are stored, and the status.
+    pub fn results(&self) -> impl Iterator<Item = Node> {
+        self.stores.iter().map(|(_, node)| *node).chain(self.status)
+    }
+}
+
 /// The sign bit of a real.
 pub const SIGN: u64 = 1 << 63;
 

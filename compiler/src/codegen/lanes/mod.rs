@@ -24,15 +24,15 @@ use super::target::{FunctionCompiler, here};
 use super::unsupported::Unsupported;
 use crate::codegen::executable_memory::Executable;
 use crate::codegen::lanes::assembler::{Assembler, Base, Vectors, instructions};
-use crate::codegen::lanes::isel::{MachineOp, Node, Nodes, select};
+use crate::codegen::lanes::isel::{MachineOp, Node, select};
 use crate::codegen::lanes::regalloc::{Home, RegisterAllocator, place_in};
-use crate::codegen::lanes::schedule::schedule;
+use crate::codegen::loop_plan::{LoopPlan, plan};
 use crate::ir::verify::{Stage, verify};
 use crate::ir::{Func, Op, Unary};
 use crate::math;
+use abi::Layout;
 use abi::lanes::{Lanes, LanesEntry};
-use abi::{Layout, Slot};
-use std::collections::{HashMap, HashSet};
+use std::collections::HashMap;
 use std::sync::Arc;
 
 /// Kind of vector.
@@ -226,24 +226,9 @@ fn generate(
     pooled: bool,
 ) -> Result<(Vec<u8>, usize), Unsupported> {
     let nodes = select(func, width, pooled)?;
-    let stored: HashSet<Slot> = func.stores.iter().map(|(slot, _)| *slot).collect();
-    let loaded: HashSet<Slot> = func.loads().into_iter().collect();
-    let carried: Vec<(Slot, Node)> = nodes.stores.iter().copied().filter(|(slot, _)| loaded.contains(slot)).collect();
-    // Without carried slots a single iteration is enough, so nothing is hoisted.
-    let variant = if carried.is_empty() { vec![true; nodes.nodes.len()] } else { is_variant(&nodes, &stored) };
-
-    // Layout after the block: two areas of carried slots, hoisted values, spill slots.
     let vector = width.bytes() as usize;
-    let areas = [0, 1].map(|area| (layout.size() + area * carried.len()) * vectors * vector);
-    let mut roots: Vec<Node> = carried.iter().map(|(_, node)| *node).chain(nodes.failed).collect();
-    let body_order = schedule(&nodes, &roots, &variant);
-    roots = nodes.stores.iter().map(|(_, node)| *node).chain(nodes.status).collect();
-    let final_order = schedule(&nodes, &roots, &variant);
-    let hoisted = invariants_to_hoist(&nodes, &[&body_order, &final_order], nodes.failed, &variant);
-    let hoisted_at = areas[1] + carried.len() * vectors * vector;
-    let prologue = schedule(&nodes, &hoisted, &variant.iter().map(|variant| !variant).collect::<Vec<_>>());
-    let spills_at = hoisted_at + hoisted.len() * vectors * vector;
-
+    let LoopPlan { carried, hoisted, prologue, body: body_order, last: final_order, areas, hoisted_at, end: spills_at } =
+        plan(&nodes, layout.size(), vectors * vector);
     let mut homes: HashMap<Node, Home> = HashMap::new();
     for (index, node) in nodes.nodes.iter().enumerate() {
         if let MachineOp::Load(slot) = node {
@@ -333,7 +318,7 @@ fn generate(
         homes
     };
     let mut body = RegisterAllocator::new(&mut code, &nodes, &final_order, &homes, width, vectors, spills_at);
-    body.write(&to_block, &roots);
+    body.write(&to_block, &nodes.results().collect::<Vec<_>>());
     spill_slots = spill_slots.max(body.spilled());
     if carried.is_empty() {
         code.raw(&[0x48, 0x89, 0xd0]); // mov rax, rdx
@@ -348,27 +333,4 @@ fn generate(
         return Err(Unsupported(format!("`{}` is too large for lanes: {} operations", func.name, func.ops.len())));
     }
     Ok((code.finish(), scratch))
-}
-
-/// For each node, whether a step can change it.
-fn is_variant(nodes: &Nodes, stored: &HashSet<Slot>) -> Vec<bool> {
-    let mut variant: Vec<bool> = Vec::with_capacity(nodes.nodes.len());
-    for node in &nodes.nodes {
-        let own = matches!(node, MachineOp::Load(slot) if stored.contains(slot));
-        variant.push(own || node.operands().any(|operand| variant[operand.index()]));
-    }
-    variant
-}
-
-/// The invariants to hoist: those that variant nodes or results read, loads and constants excepted.
-fn invariants_to_hoist(nodes: &Nodes, orders: &[&[Node]], failed: Option<Node>, variant: &[bool]) -> Vec<Node> {
-    let of_order = |node: &Node| nodes.nodes[node.index()].operands().collect::<Vec<_>>();
-    let read = orders.iter().flat_map(|order| order.iter().flat_map(of_order));
-    let stored = nodes.stores.iter().map(|(_, node)| *node).chain(nodes.status).chain(failed);
-    let mut seen = HashSet::new();
-    read.chain(stored)
-        .filter(|node| !variant[node.index()])
-        .filter(|node| !nodes.nodes[node.index()].is_leaf())
-        .filter(|node| seen.insert(*node))
-        .collect()
 }

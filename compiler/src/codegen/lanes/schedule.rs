@@ -4,12 +4,14 @@
 //!
 //! Source: Sethi, Ullman, *The Generation of Optimal Code for Arithmetic Expressions*, JACM, 1970.
 
-use crate::codegen::lanes::isel::{Node, Nodes};
+use crate::codegen::lanes::isel::{MachineOp, Node, Nodes};
+use crate::codegen::loop_plan::Line;
 use crate::ir::scc::topological_order;
+use abi::Slot;
 
 /// Orders those of the `wanted` nodes that `roots` need, loads and constants excepted. The nodes of each root are
 /// adjacent, operands first. Of several operands the one that needs most registers comes first.
-pub fn schedule(nodes: &Nodes, roots: &[Node], wanted: &[bool]) -> Vec<Node> {
+fn schedule(nodes: &Nodes, roots: &[Node], wanted: &[bool]) -> Vec<Node> {
     let is_read = |node: Node| !wanted[node.index()] || nodes.nodes[node.index()].is_leaf();
     // Sethi–Ullman number: registers that computing a node takes, if no value is shared.
     let mut need = vec![0; nodes.nodes.len()];
@@ -26,4 +28,44 @@ pub fn schedule(nodes: &Nodes, roots: &[Node], wanted: &[bool]) -> Vec<Node> {
         operands
     };
     topological_order(roots, nodes.nodes.len(), Node::index, is_read, operands)
+}
+
+impl Line for Nodes {
+    type Node = Node;
+
+    fn count(&self) -> usize {
+        self.nodes.len()
+    }
+
+    fn index(node: Node) -> usize {
+        node.index()
+    }
+
+    fn operands(&self, index: usize) -> Vec<Node> {
+        self.nodes[index].operands().collect()
+    }
+
+    fn is_leaf(&self, node: Node) -> bool {
+        self.nodes[node.index()].is_leaf()
+    }
+
+    fn load(&self, index: usize) -> Option<Slot> {
+        if let MachineOp::Load(slot) = self.nodes[index] { Some(slot) } else { None }
+    }
+
+    fn stores(&self) -> &[(Slot, Node)] {
+        &self.stores
+    }
+
+    fn status(&self) -> Option<Node> {
+        self.status
+    }
+
+    fn failed(&self) -> Option<Node> {
+        self.failed
+    }
+
+    fn schedule(&self, roots: &[Node], wanted: &[bool]) -> Vec<Node> {
+        schedule(self, roots, wanted)
+    }
 }

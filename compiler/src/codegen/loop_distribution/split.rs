@@ -9,6 +9,7 @@
 //! remaining    the step, which loads the outputs of leading
 //! ```
 
+use crate::ir::variance::{Variance, variance};
 use crate::ir::{Func, Op, Type, Value, verify};
 use abi::{Layout, Slot};
 use std::collections::HashSet;
@@ -27,17 +28,6 @@ pub struct Distribution {
     pub loads: Vec<Slot>,
 }
 
-/// The kind of variable that an operation depends on.
-#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-enum Dependence {
-    /// Only on values that no step changes.
-    Invariant,
-    /// Also on time or the step counter.
-    Time,
-    /// Also on states or other values that one step passes to the next.
-    State,
-}
-
 /// Minimum effort per step that distribution must save: a fixed part for each batch of instants, and a part for each of
 /// the `passed` values, which is stored and loaded.
 fn least_effort(passed: usize) -> u32 {
@@ -50,7 +40,7 @@ pub fn split(func: &Func, size: usize) -> Option<Distribution> {
         return None;
     }
     let types = verify::types(func).expect("the function is sound");
-    let on = dependences(func);
+    let on = variance(func, None);
     let passed = passed(func, &on, &types);
     let closure = |mut marks: Vec<bool>, through: &dyn Fn(usize) -> bool| {
         for i in (0..func.ops.len()).rev() {
@@ -68,15 +58,12 @@ pub fn split(func: &Func, size: usize) -> Option<Distribution> {
     // Booleans are not stored: operations that read them recompute them.
     let is_invariant = |i: usize| {
         let leaf = matches!(func.ops[i], Op::Real(_) | Op::Int(_) | Op::Bool(_) | Op::Load(_));
-        on[i] == Dependence::Invariant && types[i] != Type::Bool && !leaf
+        on[i].is_invariant() && types[i] != Type::Bool && !leaf
     };
     let in_leading = closure(marks(&passed), &|i| !is_invariant(i));
     let ops = |marks: &[bool]| (0..func.ops.len()).filter(|i| marks[*i]).map(|i| Value(i as u32)).collect::<Vec<_>>();
-    let saved: u32 = ops(&in_leading)
-        .into_iter()
-        .filter(|at| on[at.index()] == Dependence::Time)
-        .map(|at| func.op(at).effort())
-        .sum();
+    let saved: u32 =
+        ops(&in_leading).into_iter().filter(|at| on[at.index()] == Variance::Time).map(|at| func.op(at).effort()).sum();
     if passed.is_empty() || saved < least_effort(passed.len()) {
         return None;
     }
@@ -86,7 +73,7 @@ pub fn split(func: &Func, size: usize) -> Option<Distribution> {
     let mut loads: Vec<Slot> = Vec::new();
     for value in ops(&in_leading).into_iter().chain(ops(&in_invariants)) {
         match func.op(value) {
-            Op::Load(slot) if on[value.index()] == Dependence::Invariant && !loads.contains(&slot) => loads.push(slot),
+            Op::Load(slot) if on[value.index()].is_invariant() && !loads.contains(&slot) => loads.push(slot),
             _ => {}
         }
     }
@@ -141,26 +128,9 @@ fn advances_time(func: &Func) -> bool {
         }
 }
 
-/// The dependence of each operation.
-fn dependences(func: &Func) -> Vec<Dependence> {
-    let stored: HashSet<Slot> = func.stores.iter().map(|(slot, _)| *slot).collect();
-    let mut on: Vec<Dependence> = Vec::with_capacity(func.ops.len());
-    for op in &func.ops {
-        let mut most = match op {
-            Op::Load(slot) if [Slot::TIME, Slot::COUNT].contains(slot) => Dependence::Time,
-            Op::Load(slot) if stored.contains(slot) => Dependence::State,
-            Op::Ring { .. } => Dependence::State,
-            _ => Dependence::Invariant,
-        };
-        op.each_operand(|operand| most = most.max(on[operand.index()]));
-        on.push(most);
-    }
-    on
-}
-
 /// The values to pass from the leading to the remaining loop: values that depend on time alone and that each step
 /// needs, for states, rings or guards. Other outputs only matter after the last step, so they are not computed ahead.
-fn passed(func: &Func, on: &[Dependence], types: &[Type]) -> Vec<Value> {
+fn passed(func: &Func, on: &[Variance], types: &[Type]) -> Vec<Value> {
     let loaded: HashSet<Slot> = func.loads().into_iter().collect();
     let carried = |slot: &Slot| loaded.contains(slot) && ![Slot::TIME, Slot::COUNT].contains(slot);
     let states = func.stores.iter().filter(|(slot, _)| carried(slot)).map(|(_, value)| *value);
@@ -174,16 +144,16 @@ fn passed(func: &Func, on: &[Dependence], types: &[Type]) -> Vec<Value> {
     let mut passed = Vec::new();
     for i in (0..func.ops.len()).rev() {
         let op = func.ops[i];
-        if !needed[i] || on[i] == Dependence::Invariant {
+        if !needed[i] || on[i].is_invariant() {
             continue;
         }
         // Booleans are not stored, and an operation as cheap as a load is not worth passing.
         let mut is_cheap = op.effort() <= 1;
         op.each_operand(|operand| {
-            let is_costly = on[operand.index()] == Dependence::Time && !matches!(func.op(operand), Op::Load(_));
+            let is_costly = on[operand.index()] == Variance::Time && !matches!(func.op(operand), Op::Load(_));
             is_cheap &= !is_costly;
         });
-        if on[i] == Dependence::State || types[i] == Type::Bool || is_cheap {
+        if on[i] > Variance::Time || types[i] == Type::Bool || is_cheap {
             op.each_operand(|operand| needed[operand.index()] = true);
         } else {
             passed.push(Value(i as u32));
