@@ -49,6 +49,10 @@ impl Sources for Keeping<'_> {
         self.inner.modules()
     }
 
+    fn library_is_sound(&self) -> bool {
+        self.inner.library_is_sound()
+    }
+
     fn file(&self, from: &str, path: &str) -> Result<(String, String), String> {
         let (name, text) = self.inner.file(from, path)?;
         self.keep(&format!("file{GAP}{from}{GAP}{path}"), &name);

@@ -65,15 +65,15 @@ fn of(method: Method) -> Changes {
 
 /// The range of a state's initial value in its model, and the offset for an argument of the experiment's `run`.
 fn places(loaded: &Loaded, experiment: &str, state: &str) -> Option<(std::ops::Range<usize>, usize)> {
-    let items = &loaded.files.get(loaded.root()).ast.items;
-    let instance = items.iter().find_map(|item| match item {
+    let ast = &loaded.files.get(loaded.root()).ast;
+    let instance = ast.items().find_map(|item| match item {
         Item::Experiment(one) if one.name.text == experiment => one.body.iter().find_map(|statement| match statement {
             ExperimentStatement::Run(run) => Some(&run.instance),
             _ => None,
         }),
         _ => None,
     })?;
-    let model = items.iter().find_map(|item| match item {
+    let model = ast.items().find_map(|item| match item {
         Item::Model(model) if model.name.text == instance.model.text => Some(model),
         _ => None,
     })?;

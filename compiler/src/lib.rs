@@ -566,7 +566,7 @@ pub fn check(loaded: &mut Loaded, sources: &dyn Sources) -> Vec<Diagnostic> {
     let root = loaded.root();
     let ast = loaded.files.get(root).ast.clone();
     let gaps = loaded.models().iter().any(|model| loaded.misread(model.span));
-    for item in &ast.items {
+    for item in ast.items() {
         match item {
             Item::Model(model) => all.extend(check_model(loaded, sources, model, true)),
             Item::Experiment(experiment) => {

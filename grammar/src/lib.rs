@@ -13,6 +13,8 @@ pub mod tokens;
 
 mod split;
 
+pub mod outline;
+
 mod slips;
 
 pub mod parse;

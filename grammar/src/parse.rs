@@ -12,6 +12,7 @@ use pest::iterators::Pair;
 
 use crate::ast::*;
 use crate::diagnostic::Diagnostic;
+use crate::outline::{self, Head};
 use crate::slips;
 use crate::span::{FileId, Span};
 use crate::split::{Piece, Place, Source, begins_item};
@@ -43,6 +44,15 @@ pub fn parse(file: FileId, text: &str) -> Parsed {
     let items = reader.items();
     let lost = std::mem::take(&mut reader.lost);
     Parsed { file: File { items, lost }, diagnostics: reader.finish() }
+}
+
+/// Parses one item of a text in canonical layout.
+pub fn parse_item(file: FileId, text: &str, head: &Head) -> (Option<Item>, Vec<Diagnostic>) {
+    let mut reader = Reader::of(Source::of(file, text, head.range.clone()));
+    let declared = outline::heads(text).into_iter().filter(|head| outline::declares_for_text(head.word));
+    reader.names.file.extend(declared.map(|head| &text[head.name]));
+    let item = reader.items().pop();
+    (item, reader.finish())
 }
 
 /// For the formatter: the offsets of slashes of derivatives, as opposed to divisions.
@@ -183,11 +193,14 @@ fn says(pair: &Pair<Rule>, word: Rule) -> bool {
 
 impl<'t> Reader<'t> {
     fn new(file: FileId, text: &'t str) -> Reader<'t> {
-        let mut source = Source::new(file, text);
+        Reader::of(Source::new(file, text))
+    }
+
+    fn of(mut source: Source<'t>) -> Reader<'t> {
         let mut diagnostics = std::mem::take(&mut source.complaints);
         let braces = !diagnostics.is_empty();
         // A brace inside an unterminated comment is missing because of the comment.
-        if source.block_comments.iter().any(|span| !text[span.range()].ends_with("*/")) {
+        if source.block_comments.iter().any(|span| !source.text[span.range()].ends_with("*/")) {
             diagnostics.clear();
         }
         diagnostics.extend(slips::block_comment(&source));
@@ -318,7 +331,7 @@ impl<'t> Reader<'t> {
     fn items(&mut self) -> Vec<Item> {
         let pieces = self.source.items();
         for &Piece { start, .. } in &pieces {
-            if matches!(self.source.word(start), "const" | "fn" | "table") {
+            if outline::declares_for_text(self.source.word(start)) {
                 self.names.file.insert(self.source.word(start + 1));
             }
         }

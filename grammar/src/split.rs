@@ -7,6 +7,7 @@
 use crate::diagnostic::Diagnostic;
 use crate::span::{FileId, Span};
 use crate::tokens::{Token, TokenKind, is_keyword, tokens};
+use std::ops::Range;
 
 /// A token that is neither blank nor comment.
 #[derive(Clone, Copy)]
@@ -98,7 +99,7 @@ impl Place {
 }
 
 /// Words that begin an item.
-const ITEMS: [&str; 10] =
+pub(crate) const ITEMS: [&str; 10] =
     ["import", "const", "fn", "table", "interface", "model", "experiment", "fit", "device", "rig"];
 /// Keywords that begin a statement.
 const STARTERS: [&str; 15] = [
@@ -121,9 +122,15 @@ pub(crate) fn begins_item(word: &str) -> bool {
 
 impl<'t> Source<'t> {
     pub fn new(file: FileId, text: &'t str) -> Source<'t> {
+        Source::of(file, text, 0..text.len())
+    }
+
+    /// A part of a text, with the offsets of the whole.
+    pub fn of(file: FileId, text: &'t str, part: Range<usize>) -> Source<'t> {
         let (mut marks, mut docs, mut block_comments) = (Vec::new(), Vec::new(), Vec::new());
         let (mut fresh, mut line) = (true, 0);
-        for token in tokens(text) {
+        for token in tokens(&text[part.clone()]) {
+            let token = Token { start: part.start + token.start, end: part.start + token.end, ..token };
             match token.kind {
                 TokenKind::Newline => (fresh, line) = (true, line + 1),
                 TokenKind::Blank | TokenKind::Comment => {}

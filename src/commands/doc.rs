@@ -76,7 +76,7 @@ fn plots(folder: &Path, terminal: &mut Terminal) -> Result<(), String> {
 fn library() -> Vec<(String, Vec<Item>)> {
     let items = |(module, text): &(&'static str, &'static str)| {
         let loaded = compile::load(module, text, &project::Disk);
-        (module.to_string(), loaded.files.get(loaded.root()).ast.items.clone())
+        (module.to_string(), loaded.files.get(loaded.root()).ast.items().cloned().collect())
     };
     project::library().iter().map(items).collect()
 }

@@ -87,8 +87,8 @@ fn chosen(args: &Args, loaded: &Loaded) -> Result<String, String> {
 /// The rig that an experiment runs.
 fn run_by(name: &str, args: &Args, loaded: &Loaded) -> Result<String, String> {
     let file = args.file.display();
-    let items = &loaded.files.get(loaded.root()).ast.items;
-    let experiment = items.iter().find_map(|item| match item {
+    let ast = &loaded.files.get(loaded.root()).ast;
+    let experiment = ast.items().find_map(|item| match item {
         Item::Experiment(one) if one.name.text == name => Some(one),
         _ => None,
     });

@@ -108,7 +108,7 @@ impl Original {
         let file = loaded.files.get(loaded.root()).ast.clone();
         let mut found = Found::default();
         let mut items: Vec<(Option<String>, HashSet<&str>)> = Vec::new();
-        for item in &file.items {
+        for item in file.items() {
             found.item(item);
             let (name, span) = named(item);
             let words = text[span.range()].split(|sign: char| !sign.is_ascii_alphanumeric() && sign != '_');
@@ -118,7 +118,7 @@ impl Original {
         // A span excludes parentheses, which a mutation must keep balanced.
         found.places.retain(|place| balanced(&text[place.span.range()]));
         let mut experiments = Vec::new();
-        for (first, item) in file.items.iter().enumerate() {
+        for (first, item) in file.items().enumerate() {
             let Item::Experiment(experiment) = item else { continue };
             let mut reached = vec![first];
             let mut next = 0;

@@ -35,7 +35,7 @@ pub fn fallen(found: &[Diagnostic]) -> Fallen {
 pub fn read(name: &str, text: &str, experiment: &str, method: Method) -> Result<(Vec<Variant>, f64), Vec<Diagnostic>> {
     let sources = Texts::default();
     let mut loaded = compiler::load(name, text, &sources);
-    let has_step = loaded.files.get(loaded.root()).ast.items.iter().any(|item| match item {
+    let has_step = loaded.files.get(loaded.root()).ast.items().any(|item| match item {
         Item::Experiment(own) if own.name.text == experiment => own
             .body
             .iter()

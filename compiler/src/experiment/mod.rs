@@ -141,7 +141,7 @@ pub fn read(
     let prepared = rig_of(loaded, sources, name, &given, &mut diagnostics)?;
     let loaded = &*loaded;
     let file = loaded.files.get(root);
-    let found = file.ast.items.iter().find_map(|item| match item {
+    let found = file.ast.items().find_map(|item| match item {
         ast::Item::Experiment(experiment) if experiment.name.text == name => Some(experiment),
         _ => None,
     });
@@ -780,7 +780,7 @@ fn rig_of(
 ) -> Result<Option<Prepared>, Vec<Diagnostic>> {
     let root = loaded.root();
     let ast = loaded.files.get(root).ast.clone();
-    let run = ast.items.iter().find_map(|item| match item {
+    let run = ast.items().find_map(|item| match item {
         ast::Item::Experiment(one) if one.name.text == experiment => {
             one.body.iter().find_map(|statement| match statement {
                 ExperimentStatement::Run(run) => Some(run),

@@ -3,9 +3,10 @@
 //! In: a text and [`Sources`]. Out: always a [`Loaded`], with its diagnostics. Does not look inside items.
 
 use crate::frontend::names::nearest;
-use crate::frontend::source::{Files, SourceFile, Sources};
+use crate::frontend::source::{Files, SourceFile, Sources, Tree};
 use grammar::ast::{self, Item, Name};
 use grammar::diagnostic::Diagnostic;
+use grammar::outline::heads;
 use grammar::span::{FileId, Span};
 use std::cell::RefCell;
 use std::collections::HashMap;
@@ -24,8 +25,17 @@ pub struct Loaded {
 /// Top-level names visible in one file.
 #[derive(Clone, Debug, Default)]
 struct Scope {
-    own: HashMap<(Space, String), ItemRef>,
-    imported: HashMap<(Space, String), Vec<ItemRef>>,
+    /// By name: the items that the file declares.
+    own: HashMap<String, Vec<(Space, ItemRef)>>,
+    /// The files whose items are visible too, in the order of the imports.
+    imported: Vec<FileId>,
+}
+
+impl Scope {
+    /// The file's own item of this name.
+    fn own(&self, space: Space, name: &str) -> Option<ItemRef> {
+        self.own.get(name)?.iter().find(|(own, _)| *own == space).map(|(_, item)| *item)
+    }
 }
 
 /// Namespaces at file level.
@@ -76,32 +86,31 @@ pub struct ExperimentInfo {
 impl Loaded {
     /// The item of a reference.
     pub fn item(&self, item: ItemRef) -> &Item {
-        &self.files.get(item.file).ast.items[item.index as usize]
+        self.files.get(item.file).ast.item(item.index)
     }
 
     /// Resolves `name` in `file`. The file's own items take precedence over imported ones.
     pub fn find(&self, file: FileId, space: Space, name: &str) -> Lookup<'_> {
         let scope = &self.scopes[file.0 as usize];
-        let key = (space, name.to_string());
-        if let Some(&item) = scope.own.get(&key) {
+        if let Some(item) = scope.own(space, name) {
             return Lookup::Found(item, self.item(item));
         }
-        match scope.imported.get(&key).map(Vec::as_slice) {
-            None | Some([]) => Lookup::Missing,
-            Some([item]) => Lookup::Found(*item, self.item(*item)),
-            Some([a, b, ..]) => Lookup::Ambiguous(*a, *b),
+        let mut imported = scope.imported.iter().filter_map(|from| self.scopes[from.0 as usize].own(space, name));
+        match (imported.next(), imported.next()) {
+            (None, _) => Lookup::Missing,
+            (Some(item), None) => Lookup::Found(item, self.item(item)),
+            (Some(a), Some(b)) => Lookup::Ambiguous(a, b),
         }
     }
 
     /// All names of a namespace visible in `file`, sorted.
     pub fn visible(&self, file: FileId, space: Space) -> Vec<&str> {
         let scope = &self.scopes[file.0 as usize];
-        let mut names: Vec<&str> = scope
-            .own
-            .keys()
-            .chain(scope.imported.keys())
-            .filter(|key| key.0 == space)
-            .map(|key| key.1.as_str())
+        let scopes = std::iter::once(scope).chain(scope.imported.iter().map(|from| &self.scopes[from.0 as usize]));
+        let declared = scopes.flat_map(|scope| &scope.own);
+        let mut names: Vec<&str> = declared
+            .filter(|(_, items)| items.iter().any(|(own, _)| *own == space))
+            .map(|(name, _)| name.as_str())
             .collect();
         names.sort_unstable();
         names.dedup();
@@ -142,12 +151,12 @@ impl Loaded {
             }),
             _ => None,
         };
-        self.files.get(self.root()).ast.items.iter().filter_map(experiment).collect()
+        self.files.get(self.root()).ast.items().filter_map(experiment).collect()
     }
 
     /// Rigs of the root file, in order.
     pub fn rigs(&self) -> Vec<&ast::Rig> {
-        let items = self.files.get(self.root()).ast.items.iter();
+        let items = self.files.get(self.root()).ast.items();
         items
             .filter_map(|item| match item {
                 Item::Rig(rig) => Some(rig),
@@ -169,8 +178,7 @@ impl Loaded {
         self.files
             .get(self.root())
             .ast
-            .items
-            .iter()
+            .items()
             .filter_map(|item| match item {
                 Item::Model(model) => Some(model),
                 _ => None,
@@ -181,6 +189,20 @@ impl Loaded {
     /// Whether there are errors, which prevent compilation.
     pub fn has_errors(&self) -> bool {
         self.diagnostics.iter().any(Diagnostic::is_error)
+    }
+}
+
+impl Space {
+    /// The namespace of the items that begin with a word; `None` for imports.
+    fn of_word(word: &str) -> Option<Space> {
+        Some(match word {
+            "const" => Space::Const,
+            "fn" | "table" => Space::Function,
+            "interface" | "model" | "device" => Space::Type,
+            "experiment" | "fit" => Space::Experiment,
+            "rig" => Space::Rig,
+            _ => return None,
+        })
     }
 }
 
@@ -208,7 +230,7 @@ pub fn load(name: &str, text: &str, sources: &dyn Sources) -> Loaded {
     let mut loader = Loader { loaded: Loaded::default(), sources, by_name: HashMap::new(), open: Vec::new() };
     let root = loader.add(name.to_string(), text, false);
     let mut loaded = loader.loaded;
-    if loaded.files.get(root).ast.items.is_empty() && loaded.diagnostics.is_empty() {
+    if loaded.files.get(root).ast.items().next().is_none() && loaded.diagnostics.is_empty() {
         let error = Diagnostic::error("E0001", "there is nothing in this file").label(Span::new(root, 0, 0), "empty");
         loaded.diagnostics.push(error.help("begin with a model: `model M { … }`, or let `fric new DIR` write one"));
     }
@@ -228,43 +250,61 @@ impl Loader<'_> {
         let id = FileId(self.loaded.files.0.len() as u32);
         self.by_name.insert(name.clone(), id);
         let (text, ast) = match library {
-            true => library_tree(id, &name, text, &mut self.loaded.diagnostics),
+            true => library_tree(id, &name, text, self.sources.library_is_sound(), &mut self.loaded.diagnostics),
             false => tree(id, text, &mut self.loaded.diagnostics),
         };
-        self.loaded.files.0.push(SourceFile { name, text, ast: ast.clone(), library });
+        self.loaded.files.0.push(SourceFile { name, text: text.clone(), ast: ast.clone(), library });
         self.loaded.scopes.push(Scope::default());
-        self.declare(id, &ast);
         self.open.push(id);
-        for item in &ast.items {
-            if let Item::Import(import) = item {
-                for file in self.import(id, import) {
-                    self.bring_in(id, file);
+        match ast.heads() {
+            // The names of a text that is known to be sound are those of its heads, and none is declared twice.
+            Some(heads) => {
+                for (index, head) in heads.iter().enumerate() {
+                    match Space::of_word(head.word) {
+                        Some(space) => self.own(id, space, &text[head.name.clone()], index),
+                        None => self.item(id, ast.item(index as u32)),
+                    }
                 }
+            }
+            None => {
+                self.declare(id, &ast);
+                ast.items().for_each(|item| self.item(id, item));
             }
         }
         self.open.pop();
         id
     }
 
-    fn declare(&mut self, file: FileId, ast: &ast::File) {
-        for (index, item) in ast.items.iter().enumerate() {
+    /// Brings the names of an import into a file; other items have none to bring.
+    fn item(&mut self, into: FileId, item: &Item) {
+        if let Item::Import(import) = item {
+            for file in self.import(into, import) {
+                self.bring_in(into, file);
+            }
+        }
+    }
+
+    fn declare(&mut self, file: FileId, ast: &Tree) {
+        for (index, item) in ast.items().enumerate() {
             let Some((space, name)) = named(item) else { continue };
             if RESERVED.contains(&name.text.as_str()) && matches!(space, Space::Const | Space::Function) {
                 self.loaded.diagnostics.push(reserved(name));
                 continue;
             }
-            let item = ItemRef { file, index: index as u32 };
-            let own = &mut self.loaded.scopes[file.0 as usize].own;
-            match own.get(&(space, name.text.clone())) {
-                None => {
-                    own.insert((space, name.text.clone()), item);
-                }
-                Some(&first) => {
+            match self.loaded.scopes[file.0 as usize].own(space, &name.text) {
+                None => self.own(file, space, &name.text, index),
+                Some(first) => {
                     let first = named(self.loaded.item(first)).expect("only named items are declared").1.span;
                     self.loaded.diagnostics.push(declared_twice(name, first));
                 }
             }
         }
+    }
+
+    /// Declares an item of a file.
+    fn own(&mut self, file: FileId, space: Space, name: &str, index: usize) {
+        let item = ItemRef { file, index: index as u32 };
+        self.loaded.scopes[file.0 as usize].own.entry(name.into()).or_default().push((space, item));
     }
 
     /// The files that an import refers to.
@@ -331,21 +371,9 @@ impl Loader<'_> {
     }
 
     fn bring_in(&mut self, into: FileId, from: FileId) {
-        if into == from {
-            return;
-        }
-        let mut items: Vec<(Space, String, ItemRef)> = self.loaded.scopes[from.0 as usize]
-            .own
-            .iter()
-            .map(|((space, name), item)| (*space, name.clone(), *item))
-            .collect();
-        items.sort_by_key(|(_, _, item)| item.index);
-        let scope = &mut self.loaded.scopes[into.0 as usize];
-        for (space, name, item) in items {
-            let known = scope.imported.entry((space, name)).or_default();
-            if !known.contains(&item) {
-                known.push(item);
-            }
+        let imported = &mut self.loaded.scopes[into.0 as usize].imported;
+        if into != from && !imported.contains(&from) {
+            imported.push(from);
         }
     }
 }
@@ -353,28 +381,35 @@ impl Loader<'_> {
 /// Capacity of the cache of library trees.
 const MOST_KEPT: usize = 1000;
 
-type Tree = (Arc<str>, Arc<ast::File>);
+type Kept = (Arc<str>, Arc<Tree>);
 
 thread_local! {
     /// Key: the file id, which the spans of the tree contain, and the name.
-    static KEPT: RefCell<HashMap<(FileId, String), Tree>> = RefCell::default();
+    static KEPT: RefCell<HashMap<(FileId, String), Kept>> = RefCell::default();
 }
 
-fn tree(id: FileId, text: &str, diagnostics: &mut Vec<Diagnostic>) -> Tree {
+fn tree(id: FileId, text: &str, diagnostics: &mut Vec<Diagnostic>) -> Kept {
     let parsed = grammar::parse::parse(id, text);
     diagnostics.extend(parsed.diagnostics);
-    (text.into(), Arc::new(parsed.file))
+    (text.into(), Arc::new(parsed.file.into()))
 }
 
 /// As [`tree`], with a cache for library texts, which many texts import. An entry is valid while the text is the same.
-fn library_tree(id: FileId, name: &str, text: &str, diagnostics: &mut Vec<Diagnostic>) -> Tree {
+/// The items of a text that is known to be sound are parsed when they are first needed.
+fn library_tree(id: FileId, name: &str, text: &str, is_sound: bool, diagnostics: &mut Vec<Diagnostic>) -> Kept {
     let key = (id, name.to_string());
     let known = KEPT.with_borrow(|kept| kept.get(&key).filter(|(known, _)| **known == *text).cloned());
     if let Some(known) = known {
         return known;
     }
     let before = diagnostics.len();
-    let new = tree(id, text, diagnostics);
+    let new = match is_sound {
+        true => {
+            let text: Arc<str> = text.into();
+            (text.clone(), Arc::new(Tree::of_heads(id, text.clone(), heads(&text))))
+        }
+        false => tree(id, text, diagnostics),
+    };
     if diagnostics.len() == before {
         KEPT.with_borrow_mut(|kept| {
             if kept.len() >= MOST_KEPT {

@@ -2,9 +2,11 @@
 //!
 //! In: names of modules and files. Out: texts. Opens no file itself; the caller implements [`Sources`].
 
-use grammar::ast;
+use grammar::ast::{self, Item};
+use grammar::outline::Head;
+use grammar::parse::parse_item;
 use grammar::span::{FileId, Span};
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 
 /// Finds imports and the files that a text names. The compiler itself opens no file.
 pub trait Sources {
@@ -13,6 +15,12 @@ pub trait Sources {
 
     /// The names of all library modules, for suggestions in messages.
     fn modules(&self) -> Vec<String>;
+
+    /// Whether the texts of the library are known to be without errors and in canonical layout, so that an item may be
+    /// parsed when it is first needed.
+    fn library_is_sound(&self) -> bool {
+        false
+    }
 
     /// Reads a file named in the text called `from`. Returns the file's name and its text.
     ///
@@ -37,6 +45,50 @@ impl Sources for NoSources {
     }
 }
 
+/// The syntax tree of a text, each item parsed when it is first needed if the text is known to be without errors.
+#[derive(Default, Debug)]
+pub struct Tree {
+    items: Vec<OnceLock<Item>>,
+    /// Where the items are that have not been parsed; `None` if all have been.
+    rest: Option<(FileId, Arc<str>, Vec<Head>)>,
+    /// As [`ast::File::lost`].
+    pub lost: Vec<String>,
+}
+
+impl From<ast::File> for Tree {
+    fn from(file: ast::File) -> Tree {
+        let ast::File { items, lost } = file;
+        Tree { items: items.into_iter().map(OnceLock::from).collect(), rest: None, lost }
+    }
+}
+
+impl Tree {
+    /// The tree of a text without errors in canonical layout, whose items begin at `heads`.
+    pub fn of_heads(file: FileId, text: Arc<str>, heads: Vec<Head>) -> Tree {
+        let items = heads.iter().map(|_| OnceLock::new()).collect();
+        Tree { items, rest: Some((file, text, heads)), lost: Vec::new() }
+    }
+
+    /// The item of this number.
+    pub fn item(&self, index: u32) -> &Item {
+        self.items[index as usize].get_or_init(|| {
+            let (file, text, heads) = self.rest.as_ref().expect("a parsed tree has its items");
+            let (item, found) = parse_item(*file, text, &heads[index as usize]);
+            item.filter(|_| found.is_empty()).unwrap_or_else(|| panic!("a text that was known to be sound: {found:?}"))
+        })
+    }
+
+    /// The words and names of the items, without parsing them; `None` if all have been parsed.
+    pub fn heads(&self) -> Option<&[Head]> {
+        self.rest.as_ref().map(|(_, _, heads)| heads.as_slice())
+    }
+
+    /// All items, in the order of the text.
+    pub fn items(&self) -> impl Iterator<Item = &Item> {
+        (0..self.items.len()).map(|index| self.item(index as u32))
+    }
+}
+
 /// One text of a compilation.
 #[derive(Clone, Debug)]
 pub struct SourceFile {
@@ -45,7 +97,7 @@ pub struct SourceFile {
     /// The text.
     pub text: Arc<str>,
     /// The syntax tree.
-    pub ast: Arc<ast::File>,
+    pub ast: Arc<Tree>,
     /// Whether it belongs to the library.
     pub library: bool,
 }

@@ -20,7 +20,7 @@ mod wires;
 use crate::analysis::parameter_checks;
 use crate::frontend::flatten::{self, BusNode, Frame, Framed, Instance, Override, Scope, flatten};
 use crate::frontend::resolve::{ItemRef, Loaded, Lookup, Space};
-use crate::frontend::source::{Files, Sources};
+use crate::frontend::source::{Files, Sources, Tree};
 use crate::frontend::system::*;
 use crate::frontend::units::{self, Types};
 use crate::ir::program::Program;
@@ -49,7 +49,7 @@ pub const PLANT_STEPS: u32 = 50;
 
 /// A rig with the descriptions of its drives and devices, which come from texts of their own.
 pub struct Prepared {
-    ast: Arc<ast::File>,
+    ast: Arc<Tree>,
     item: ItemRef,
     model: ast::Model,
     descriptions: Vec<Description>,
@@ -59,7 +59,7 @@ pub struct Prepared {
 impl Prepared {
     /// The syntax tree of the rig.
     pub fn rig(&self) -> &ast::Rig {
-        match &self.ast.items[self.item.index as usize] {
+        match self.ast.item(self.item.index) {
             Item::Rig(rig) => rig,
             _ => unreachable!("a rig was found here"),
         }
@@ -89,7 +89,7 @@ pub fn find(loaded: &Loaded, file: FileId, name: &Name) -> Result<ItemRef, Diagn
 /// Reads the descriptions of a rig's drives and devices.
 pub fn prepare(loaded: &mut Loaded, sources: &dyn Sources, item: ItemRef) -> Prepared {
     let ast = loaded.files.get(item.file).ast.clone();
-    let Item::Rig(rig) = &ast.items[item.index as usize] else { unreachable!("a rig was found here") };
+    let Item::Rig(rig) = ast.item(item.index) else { unreachable!("a rig was found here") };
     let mut diagnostics = Vec::new();
     let descriptions = nodes::describe(loaded, sources, item.file, rig, &mut diagnostics);
     // The parts and instance of the rig, from which suggestions for misspelt names are made.

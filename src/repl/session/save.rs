@@ -56,7 +56,7 @@ impl Session {
 /// Statements of an experiment as written, with the duration replaced if one is given.
 pub(super) fn statements(loaded: &Loaded, name: &str, duration: Option<f64>) -> Vec<String> {
     let file = loaded.files.get(loaded.root());
-    let found = file.ast.items.iter().find_map(|item| match item {
+    let found = file.ast.items().find_map(|item| match item {
         Item::Experiment(experiment) if experiment.name.text == name => Some(experiment),
         _ => None,
     });
