@@ -19,8 +19,9 @@ use abi::plan::Method;
 use abi::rosenbrock::layout::Trial;
 use abi::table::{Code, Interpret, Machine};
 use abi::{Description, Function, Layout};
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, OnceLock};
+use std::thread::Builder;
 
 /// The functions that a method needs, expanded to arithmetic.
 pub fn functions(program: &Program, method: Method) -> Vec<(Function, Func)> {
@@ -107,9 +108,10 @@ pub fn code(functions: &[(Function, Func)], description: &Description, interpret
     }
 }
 
-/// Tiered code, for runs that are not in real time: each function is built at its first call and compiled once it has
-/// run so often that compiling pays. So a model makes its first step before anything is compiled, and functions that
-/// run once, such as the start, are never compiled.
+/// Tiered code, for runs that are not in real time: each function is built at its first call and interpreted until it
+/// has run so often that compiling pays. It is then compiled by a thread of its own while the interpreter continues. So
+/// a model makes its first step before anything is compiled, no run waits for code, and functions that run once, such
+/// as the start, are never compiled.
 pub fn late(program: &Program, method: Method, interpret: bool) -> (Code, Vec<String>) {
     let size = program.derivatives.ops.len() + program.outputs.ops.len() + program.start.ops.len();
     match target::here() {
@@ -124,26 +126,53 @@ pub fn late(program: &Program, method: Method, interpret: bool) -> (Code, Vec<St
 /// machine code.
 pub fn on_demand(program: &Program, method: Method, interpret: bool) -> Code {
     let interpret = interpret || target::here().is_err();
-    Code::Interpreted(Arc::new(Tiered { program: program.clone(), method, interpret, forms: Default::default() }))
+    tiered(program, method, if interpret { Policy::NEVER } else { Policy::USUAL })
+}
+
+/// Tiered code with a policy of its own.
+pub fn tiered(program: &Program, method: Method, policy: Policy) -> Code {
+    let functions = Functions { program: program.clone(), method, policy, forms: Default::default() };
+    Code::Interpreted(Arc::new(Tiered(Arc::new(functions))))
 }
 
 /// Maximum number of operations, before elementary functions are expanded, for which compilation surely succeeds.
 const MAX_TIERED_OPS: usize = 5_000;
 
-/// Number of runs of a function that take about as long as compiling it: interpreting an operation takes some 10 ns,
-/// compiling it some 2 µs.
-const TIER_UP_CALLS: u64 = 200;
+/// When the functions of tiered code are compiled. The bits of a run do not depend on it.
+#[derive(Clone, Debug)]
+pub struct Policy {
+    /// For each function, in the order of [`Function::ALL`]: the number of runs after which it is compiled; `None`:
+    /// never. Attempts at adaptive steps count one by one.
+    pub compiled_after: [Option<u64>; Function::ALL.len()],
+    /// Whether a thread of its own compiles, while the interpreter continues; otherwise the next call waits for it.
+    pub in_background: bool,
+}
 
-/// The same for attempts at an adaptive step. Compiling its long function takes some 13 ms, because the time of register
-/// allocation grows faster than the length, and interpreting it some 17 µs.
-const TIER_UP_ATTEMPTS: u64 = 800;
+impl Policy {
+    /// Everything is interpreted.
+    pub const NEVER: Policy = Policy { compiled_after: [None; Function::ALL.len()], in_background: false };
+
+    /// Compiles when the runs so far have taken about half as long as compiling takes: interpreting an operation takes
+    /// some 2 ns, compiling it some 2 µs. An adaptive step takes some 13 ms, because the time of register allocation
+    /// grows faster than the length, and 3.4 µs to interpret.
+    pub const USUAL: Policy = {
+        let mut compiled_after = [Some(500); Function::ALL.len()];
+        compiled_after[Function::Rosenbrock as usize] = Some(2000);
+        Policy { compiled_after, in_background: true }
+    };
+}
+
+/// Runs of the interpreter within one call before it looks again whether the code has been compiled.
+const RUNS_BETWEEN_LOOKS: u64 = 64;
+
+/// Code whose functions are compiled one by one.
+struct Tiered(Arc<Functions>);
 
 /// The functions of a program, each in the tier it has reached.
-struct Tiered {
+struct Functions {
     program: Program,
     method: Method,
-    /// Whether no function becomes machine code.
-    interpret: bool,
+    policy: Policy,
     forms: [Forms; Function::ALL.len()],
 }
 
@@ -154,11 +183,13 @@ struct Forms {
     interpreter: OnceLock<Interpreter>,
     /// Machine code; the inner `None` means that the function is too large.
     machine: OnceLock<Option<Machine>>,
+    /// Whether somebody compiles it or has done so.
+    is_claimed: AtomicBool,
     /// Number of iterations run so far.
     runs: AtomicU64,
 }
 
-impl Tiered {
+impl Functions {
     /// The function, expanded to arithmetic.
     fn func(&self, which: Function) -> Option<&(Function, Func)> {
         let make = || Some((which, function(&self.program, self.method, which)?));
@@ -176,40 +207,71 @@ impl Tiered {
         let func = self.func(which).unwrap_or_else(|| panic!("the code has no function `{}`", which.name()));
         back_end(std::slice::from_ref(func), &self.program.description.layout, self.program.description.pool.len())
     }
+
+    /// Machine code of a function, if it has been compiled and is not too large for that.
+    fn machine(&self, which: Function) -> Option<&Machine> {
+        self.forms[which as usize].machine.get()?.as_ref()
+    }
+
+    fn compile(&self, which: Function) {
+        let make = |funcs: &[_], layout: &Layout, pool| jit::compile_prepared(funcs, layout, pool).ok().map(|it| it.0);
+        self.forms[which as usize].machine.get_or_init(|| self.make(which, make));
+    }
+}
+
+impl Tiered {
+    /// Compiles a function if that pays by now and nobody has begun to; `least`: the least number of runs that follow.
+    fn consider(&self, which: Function, least: u64) {
+        let forms = &self.0.forms[which as usize];
+        let Some(after) = self.0.policy.compiled_after[which as usize] else { return };
+        let pays = forms.runs.load(Ordering::Relaxed).saturating_add(least) > after;
+        if !pays || forms.is_claimed.swap(true, Ordering::Relaxed) {
+            return;
+        }
+        let functions = self.0.clone();
+        let background = || Builder::new().name("compiler".into()).spawn(move || functions.compile(which));
+        // Where no thread can be had, the caller compiles.
+        if !self.0.policy.in_background || background().is_err() {
+            self.0.compile(which);
+        }
+    }
 }
 
 impl Interpret for Tiered {
     fn call(&self, which: Function, block: &mut [f64], pool: &[f64], count: u64) -> u64 {
-        let forms = &self.forms[which as usize];
-        let make = |funcs: &[_], layout: &Layout, pool| jit::compile_prepared(funcs, layout, pool).ok().map(|it| it.0);
-        let compiled = || self.make(which, make);
-        // A call for adaptive steps ends at the first step that it leaves open, most often long before `count`.
-        let (least, pays_after) = match which {
-            Function::Rosenbrock => (1, TIER_UP_ATTEMPTS),
-            _ => (count, TIER_UP_CALLS),
-        };
-        let pays = || forms.runs.load(Ordering::Relaxed).saturating_add(least) > pays_after;
-        if !self.interpret
-            && (forms.machine.get().is_some() || pays())
-            && let Some(machine) = forms.machine.get_or_init(compiled)
-        {
-            return machine.call(which, block, pool, count);
+        let forms = &self.0.forms[which as usize];
+        let settled = |block: &[f64]| self.0.settled(which, block);
+        let mut left = count;
+        loop {
+            // A call for adaptive steps ends at the first step that it leaves open, most often long before `count`.
+            let least = if which == Function::Rosenbrock { 1 } else { left };
+            if forms.machine.get().is_none() {
+                self.consider(which, least);
+            }
+            // Machine code for a single step may leave the count to the caller, who stores it only after a single step.
+            let keeps_count = which != Function::Step || left > 1 || count == 1;
+            if let Some(machine) = self.0.machine(which).filter(|_| keeps_count) {
+                return machine.call(which, block, pool, left);
+            }
+            let runs = left.min(RUNS_BETWEEN_LOOKS);
+            let before = settled(block);
+            let interpreter = forms.interpreter.get_or_init(|| self.0.make(which, Interpreter::new));
+            let status = interpreter.call(which, block, pool, runs);
+            let done = least.min(runs).saturating_add(settled(block).saturating_sub(before));
+            forms.runs.fetch_add(done, Ordering::Relaxed);
+            left -= runs;
+            if status != 0 || left == 0 {
+                return status;
+            }
         }
-        let settled = |block: &[f64]| self.settled(which, block);
-        let before = settled(block);
-        let status =
-            forms.interpreter.get_or_init(|| self.make(which, Interpreter::new)).call(which, block, pool, count);
-        let runs = least.saturating_add(settled(block).saturating_sub(before));
-        forms.runs.fetch_add(runs, Ordering::Relaxed);
-        status
     }
 
     fn made(&self, which: Function) -> Option<&Machine> {
-        self.forms[which as usize].machine.get()?.as_ref()
+        self.0.machine(which)
     }
 
     fn has(&self, which: Function) -> bool {
-        needs(&self.program, self.method, which) && (which != Function::Rosenbrock || self.func(which).is_some())
+        needs(&self.0.program, self.0.method, which) && (which != Function::Rosenbrock || self.0.func(which).is_some())
     }
 }
 
@@ -235,11 +297,13 @@ mod tests {
         built.map_err(|found| format!("{found:?}")).expect("it compiles").program
     }
 
+    const CALLS: u64 = 600;
+
     /// The block after each of a number of calls.
     fn blocks_after_calls(code: Code, program: &Program) -> Vec<Vec<u64>> {
         let mut instance = Instance::new(Arc::new(program.description.clone()), code, &program.params);
         assert_eq!(instance.start(1e-3), 0);
-        let counts = (0..2 * TIER_UP_CALLS).map(|_| 1).chain([TIER_UP_CALLS + 1, 3]);
+        let counts = (0..2 * CALLS).map(|_| 1).chain([CALLS + 1, 3]);
         let bits = |instance: &Instance| instance.block().iter().map(|x| x.to_bits()).collect();
         counts
             .enumerate()

@@ -7,6 +7,7 @@ use super::{Op, Value};
 /// for elementary functions.
 ///
 /// A NaN result may have any payload and sign, because all NaN count as one value.
+#[inline(always)]
 pub fn evaluate(op: Op, bits: impl Fn(Value) -> u64) -> Option<u64> {
     let real = |value| f64::from_bits(bits(value));
     let int = |value| bits(value) as i64;

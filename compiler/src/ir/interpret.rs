@@ -8,6 +8,12 @@ use crate::ir::verify::{Stage, verify};
 use crate::ir::{Func, Op};
 use abi::table::Interpret;
 use abi::{Function, Layout};
+use std::cell::Cell;
+
+thread_local! {
+    /// Scratch space for the values of a function, kept from call to call.
+    static VALUES: Cell<Vec<u64>> = const { Cell::new(Vec::new()) };
+}
 
 /// The functions of a model, ready to be interpreted.
 #[derive(Clone, Default)]
@@ -40,14 +46,11 @@ impl Interpret for Interpreter {
         let func = self.funcs[function as usize]
             .as_ref()
             .unwrap_or_else(|| panic!("the code has no function `{}`", function.name()));
-        let mut values = vec![0; func.ops.len()];
-        for _ in 0..count {
-            let status = run(func, block, pool, &mut values);
-            if status != 0 {
-                return status;
-            }
-        }
-        0
+        let mut values = VALUES.take();
+        values.resize(func.ops.len(), 0);
+        let status = repeat(func, block, pool, &mut values, count);
+        VALUES.set(values);
+        status
     }
 
     fn has(&self, function: Function) -> bool {
@@ -57,10 +60,41 @@ impl Interpret for Interpreter {
 
 /// Runs an expanded function once and returns its status. The block may have any size that holds all slots in use.
 pub fn run_once(func: &Func, block: &mut [f64], pool: &[f64]) -> u64 {
-    run(func, block, pool, &mut vec![0; func.ops.len()])
+    repeat(func, block, pool, &mut vec![0; func.ops.len()], 1)
 }
 
-/// Runs a function once. `values` is scratch space for the bits of every value.
+/// Runs a function up to `count` times, until a status that is not 0. `values` is scratch space for the bits of every
+/// value.
+fn repeat(func: &Func, block: &mut [f64], pool: &[f64], values: &mut [u64], count: u64) -> u64 {
+    /// The same with the instructions for fused products and for rounding to integers, which are calls otherwise and
+    /// then take most of the time.
+    #[cfg(target_arch = "x86_64")]
+    #[target_feature(enable = "fma,sse4.1")]
+    fn with_fma(func: &Func, block: &mut [f64], pool: &[f64], values: &mut [u64], count: u64) -> u64 {
+        until_status(count, || run(func, block, pool, values))
+    }
+    #[cfg(target_arch = "x86_64")]
+    if is_x86_feature_detected!("fma") && is_x86_feature_detected!("sse4.1") {
+        // SAFETY: the processor has just been asked for both.
+        return unsafe { with_fma(func, block, pool, values, count) };
+    }
+    until_status(count, || run(func, block, pool, values))
+}
+
+/// Runs up to `count` times; returns the first status that is not 0, or 0.
+#[inline(always)]
+fn until_status(count: u64, mut run: impl FnMut() -> u64) -> u64 {
+    for _ in 0..count {
+        let status = run();
+        if status != 0 {
+            return status;
+        }
+    }
+    0
+}
+
+/// Runs a function once.
+#[inline(always)]
 fn run(func: &Func, block: &mut [f64], pool: &[f64], values: &mut [u64]) -> u64 {
     for (i, op) in func.ops.iter().enumerate() {
         values[i] = match *op {
