@@ -31,23 +31,24 @@ struct Contact {
 }
 
 fn contacts(system: &System, types: &Types) -> Vec<Contact> {
-    let named = |part: InstanceId, kind: VarKind, name: &str| {
-        system.var_ids().find(|id| {
-            let var = system.var(*id);
-            var.instance == part && var.kind == kind && var.name == name
-        })
+    let mut ports: Vec<[Option<VarId>; 3]> = vec![[None; 3]; system.instances.len()];
+    for id in system.var_ids() {
+        let var = system.var(id);
+        let port = match (var.kind, var.name.as_str()) {
+            (VarKind::Output, "F") => 0,
+            (VarKind::Param, "m") => 1,
+            (VarKind::Input, "v") => 2,
+            _ => continue,
+        };
+        ports[var.instance.0 as usize][port].get_or_insert(id);
+    }
+    let contact = |ports: [Option<VarId>; 3]| {
+        let [Some(force), Some(mass), Some(speed)] = ports else { return None };
+        let held = matches!(system.var(force).definition, Definition::Held { .. });
+        let fits = [MASS, INERTIA].contains(&types.units[mass.0 as usize].dimension);
+        (held && fits).then_some(Contact { speed, force, mass })
     };
-    let parts = (0..system.instances.len() as u32).map(InstanceId);
-    parts
-        .filter_map(|part| {
-            let force = named(part, VarKind::Output, "F")?;
-            let held = matches!(system.var(force).definition, Definition::Held { .. });
-            let mass = named(part, VarKind::Param, "m")?;
-            let fits = [MASS, INERTIA].contains(&types.units[mass.0 as usize].dimension);
-            let contact = Contact { speed: named(part, VarKind::Input, "v")?, force, mass };
-            (held && fits).then_some(contact)
-        })
-        .collect()
+    ports.into_iter().filter_map(contact).collect()
 }
 
 /// Checks the contacts of a system. `elsewhere`: the accelerated mass in SI units, for systems that do not contain it,

@@ -43,10 +43,11 @@ pub fn with_fewer_addends(build: &mut Build, failed: Value, stored: &[Value]) ->
     // The test is d ≤ d with d = sum − sum: d is 0 for a finite sum, and NaN otherwise.
     let Some((test, sum)) = list.iter().find_map(finiteness_test) else { return failed };
     let (mut addends, mut open) = (Vec::new(), vec![sum]);
+    let (mut seen, stored) = (HashSet::new(), HashSet::<Value>::from_iter(stored.iter().copied()));
     while let Some(value) = open.pop() {
         match build.get(value) {
             Op::Add(a, b) if !stored.contains(&value) => open.extend([b, a]),
-            _ if !addends.contains(&value) => addends.push(value),
+            _ if seen.insert(value) => addends.push(value),
             _ => {}
         }
     }
