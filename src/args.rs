@@ -175,6 +175,14 @@ pub struct Trust {
     pub digits: Option<u8>,
 }
 
+/// Where the time goes.
+#[derive(clap::Args, Clone, Copy, Debug)]
+pub struct Timed {
+    /// Print how long each stage took, to the standard error
+    #[arg(long)]
+    pub timings: bool,
+}
+
 /// `fric run`
 #[derive(clap::Args, Debug)]
 pub struct Run {
@@ -213,6 +221,9 @@ pub struct Run {
     /// Interpret instead of making machine code: slow, for comparison
     #[arg(long)]
     pub interpret: bool,
+    /// Where the time goes
+    #[command(flatten)]
+    pub timed: Timed,
 }
 
 /// `fric test`
@@ -233,6 +244,9 @@ pub struct Test {
     /// Interpret instead of making machine code: slow, for comparison
     #[arg(long)]
     pub interpret: bool,
+    /// Where the time goes
+    #[command(flatten)]
+    pub timed: Timed,
 }
 
 /// `fric sweep`
@@ -493,6 +507,9 @@ pub struct Check {
     /// Print one line each: `file:line:column: E0101 message`
     #[arg(long, conflicts_with = "json")]
     pub short: bool,
+    /// Where the time goes
+    #[command(flatten)]
+    pub timed: Timed,
 }
 
 /// `fric fmt`

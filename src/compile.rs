@@ -204,6 +204,14 @@ impl Stages {
     pub fn total(&self) -> f64 {
         self.0.iter().map(|(_, seconds)| seconds).sum()
     }
+
+    /// Adds a duration in s to a stage, which may consist of several parts, as for the cases of a sweep.
+    pub fn add(&mut self, stage: &'static str, seconds: f64) {
+        match self.0.iter_mut().find(|(name, _)| *name == stage) {
+            Some((_, sum)) => *sum += seconds,
+            None => self.0.push((stage, seconds)),
+        }
+    }
 }
 
 /// Times stages: each lasts until the next begins, or until [`Stopwatch::stop`].
@@ -232,12 +240,7 @@ impl Stopwatch {
 
     fn end(&mut self) {
         let Some((stage, since)) = self.since.take() else { return };
-        let seconds = since.elapsed().as_secs_f64();
-        // A stage may consist of several parts, as for the cases of a sweep.
-        match self.stages.0.iter_mut().find(|(name, _)| *name == stage) {
-            Some((_, sum)) => *sum += seconds,
-            None => self.stages.0.push((stage, seconds)),
-        }
+        self.stages.add(stage, since.elapsed().as_secs_f64());
     }
 }
 

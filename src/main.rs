@@ -22,6 +22,7 @@ mod parquet;
 mod project;
 mod repl;
 mod terminal;
+mod timings;
 mod results;
 mod signing;
 mod source_snapshot;
@@ -32,10 +33,12 @@ mod commands;
 use clap::Parser;
 use commands::End;
 use std::process::ExitCode;
+use std::time::Instant;
 
 fn main() -> ExitCode {
+    let begin = Instant::now();
     let args = args::Args::parse();
-    match commands::run(&args, &mut terminal::Terminal::new()) {
+    match commands::run(&args, begin, &mut terminal::Terminal::new()) {
         End::Fine => ExitCode::SUCCESS,
         End::Failed => ExitCode::from(1),
         End::Misused => ExitCode::from(2),

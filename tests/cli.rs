@@ -181,6 +181,26 @@ fn quiet_says_nothing_when_all_is_well() {
 }
 
 #[test]
+fn timings_name_every_stage_and_leave_the_standard_output_as_it_is() {
+    let folder = Folder::new("timings").with("pull.fric", PULL);
+    let stages = |table: &str| -> Vec<String> {
+        let rows = table.lines().skip_while(|line| !line.starts_with("timings")).skip(1);
+        rows.map(|row| row.split_whitespace().next().unwrap().to_string()).collect()
+    };
+    let (out, err) = folder.check(&["run", "--timings", "--json", "pull.fric", "holds"], 0, "");
+    assert_eq!(out.lines().count(), 1);
+    let compiled = ["arguments", "read", "parse", "models", "names", "flatten", "check", "lower", "code"];
+    assert_eq!(stages(&err), [&compiled[..], &["run", "errors", "files", "other", "together"]].concat());
+    let (_, err) = folder.check(&["run", "--timings", "--no-error", "pull.fric"], 1, "");
+    assert_eq!(stages(&err), [&compiled[..], &["run", "files", "other", "together"]].concat(), "three experiments");
+    let (_, err) = folder.check(&["check", "--timings", "pull.fric"], 0, "");
+    assert_eq!(stages(&err), ["arguments", "read", "parse", "check", "other", "together"]);
+    let (_, err) = folder.check(&["test", "--timings", "pull.fric"], 1, "");
+    assert_eq!(stages(&err), [&compiled[..], &["run", "errors", "other", "together"]].concat());
+    assert_eq!(folder.check(&["check", "pull.fric"], 0, "").1, "", "only on request");
+}
+
+#[test]
 fn a_closed_pipe_is_no_failure() {
     let folder = Folder::new("closed-pipe").with("pull.fric", PULL);
     for args in [&["run", "pull.fric", "holds"][..], &["man"], &["completions", "bash"], &["test", "pull.fric"]] {

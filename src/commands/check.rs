@@ -2,14 +2,15 @@
 
 use super::End;
 use crate::args::Check;
-use crate::compile::{self, Loaded};
+use crate::compile::{self, Loaded, Stopwatch};
 use crate::terminal::Terminal;
+use crate::timings::Timings;
 use crate::{project, report};
 use grammar::diagnostic::Diagnostic;
 use serde_json::Value;
 use std::path::Path;
 
-pub fn check(args: &Check, terminal: &mut Terminal) -> End {
+pub fn check(args: &Check, timings: &mut Timings, terminal: &mut Terminal) -> End {
     let mut all = Vec::new();
     let (mut errors, mut warnings, mut unread) = (0, 0, 0);
     let files = match project::expanded(&args.files) {
@@ -20,7 +21,7 @@ pub fn check(args: &Check, terminal: &mut Terminal) -> End {
         }
     };
     for path in &files {
-        let Some((loaded, found)) = found_in(path, terminal) else {
+        let Some((loaded, found)) = found_in(path, timings, terminal) else {
             unread += 1;
             continue;
         };
@@ -51,12 +52,16 @@ pub fn check(args: &Check, terminal: &mut Terminal) -> End {
 }
 
 /// All diagnostics of a text, without duplicates; none if it cannot be read.
-fn found_in(path: &Path, terminal: &Terminal) -> Option<(Loaded, Vec<Diagnostic>)> {
+fn found_in(path: &Path, timings: &mut Timings, terminal: &Terminal) -> Option<(Loaded, Vec<Diagnostic>)> {
     let name = path.display().to_string();
+    let mut watch = Stopwatch::start("read");
     match project::read(path) {
         Ok(text) => {
+            watch.stage("parse");
             let mut loaded = compile::load(&name, &text, &project::Disk);
+            watch.stage("check");
             let found = compile::check(&mut loaded, &project::Disk);
+            timings.add_all(&watch.stop());
             Some((loaded, found))
         }
         Err(reason) => {

@@ -30,12 +30,14 @@ mod test;
 use crate::args::{Args, Command, Key, Repl};
 use crate::compile::{self, Case, Loaded, Options, Sources, Stages, Stopwatch};
 use crate::terminal::Terminal;
+use crate::timings::Timings;
 use crate::{project, report};
 use clap::CommandFactory;
 use grammar::diagnostic::Diagnostic;
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use runtime::engine::sweep as runs;
 use runtime::engine::{Continue, Failure, Outcome};
+use runtime::record::Recording;
 use std::path::Path;
 use std::time::Instant;
 
@@ -52,12 +54,22 @@ pub enum End {
     Stopped,
 }
 
-/// Runs the command of the arguments.
-pub fn run(args: &Args, terminal: &mut Terminal) -> End {
+/// Runs the command of the arguments. `begin`: when the program began.
+pub fn run(args: &Args, begin: Instant, terminal: &mut Terminal) -> End {
     let Some(command) = &args.command else { return repl::repl(&Repl::default(), terminal) };
     match command {
-        Command::Run(run) => run::run(run, terminal),
-        Command::Test(test) => test::test(test, terminal),
+        Command::Run(run) => {
+            let mut timings = Timings::new(run.timed.timings, begin);
+            let end = run::run(run, &mut timings, terminal);
+            timings.print(terminal);
+            end
+        }
+        Command::Test(test) => {
+            let mut timings = Timings::new(test.timed.timings, begin);
+            let end = test::test(test, &mut timings, terminal);
+            timings.print(terminal);
+            end
+        }
         Command::Sweep(sweep) => sweep::sweep(sweep, terminal),
         Command::Linearise(linearise) => linearise::linearise(linearise, terminal),
         Command::Bench(args) => bench::bench(args, terminal),
@@ -65,7 +77,12 @@ pub fn run(args: &Args, terminal: &mut Terminal) -> End {
         Command::Hil(args) => hil::hil(args, terminal),
         Command::Predict(args) => predict::predict(args, terminal),
         Command::Replay(args) => replay::replay(args, terminal),
-        Command::Check(check) => check::check(check, terminal),
+        Command::Check(check) => {
+            let mut timings = Timings::new(check.timed.timings, begin);
+            let end = check::check(check, &mut timings, terminal);
+            timings.print(terminal);
+            end
+        }
         Command::Fmt(fmt) => fmt::fmt(fmt, terminal),
         Command::Explain(explain) => explain::explain(explain, terminal),
         Command::Characterise(args) => characterise::characterise(args, terminal),
@@ -234,6 +251,18 @@ fn reported(loaded: &Loaded, diagnostics: &[Diagnostic], terminal: &Terminal) {
 /// Runs the cases of an experiment, with a progress bar on a terminal if it takes a while. With `errors`, also
 /// estimates their numerical errors.
 fn done(cases: Vec<Case>, stages: Stages, quiet: bool, errors: bool) -> Done {
+    done_beside(cases, stages, quiet, errors, |_, _| ()).0
+}
+
+/// As [`done`], and calls `beside` with the cases and their recordings, in a thread of its own while the errors are
+/// estimated.
+fn done_beside<T: Send>(
+    cases: Vec<Case>,
+    stages: Stages,
+    quiet: bool,
+    errors: bool,
+    beside: impl FnOnce(&[Case], &[Recording]) -> T + Send,
+) -> (Done, T) {
     let bar = ProgressBar::with_draw_target(
         Some(1000),
         if quiet { ProgressDrawTarget::hidden() } else { ProgressDrawTarget::stderr() },
@@ -259,11 +288,29 @@ fn done(cases: Vec<Case>, stages: Stages, quiet: bool, errors: bool) -> Done {
         .collect();
     let mut results = runs::run(&all, &watch);
     let wall = begin.elapsed().as_secs_f64();
-    if errors {
+    // The estimate needs no recording.
+    let recordings: Vec<Recording> = results.iter_mut().map(|result| std::mem::take(recording(result))).collect();
+    let (told, judging) = std::thread::scope(|scope| {
+        let begin = Instant::now();
+        let beside = || beside(&cases, &recordings);
+        if !errors {
+            return (beside(), 0.0);
+        }
+        let beside = scope.spawn(beside);
         bar.set_position(0);
         runs::judge(&all, &mut results, &watch);
-    }
-    let judging = begin.elapsed().as_secs_f64() - wall;
+        let judging = begin.elapsed().as_secs_f64();
+        (beside.join().unwrap_or_else(|why| std::panic::resume_unwind(why)), judging)
+    });
+    results.iter_mut().zip(recordings).for_each(|(result, own)| *recording(result) = own);
     bar.finish_and_clear();
-    Done { cases, results, wall, judging, stages }
+    (Done { cases, results, wall, judging, stages }, told)
+}
+
+/// What a run recorded, up to its end or its failure.
+fn recording(result: &mut Result<Outcome, Failure>) -> &mut Recording {
+    match result {
+        Ok(outcome) => &mut outcome.recording,
+        Err(failure) => &mut failure.recording,
+    }
 }

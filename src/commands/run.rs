@@ -1,21 +1,24 @@
 //! `fric run`: compiles experiments, runs them, and shows and writes their results.
 
-use super::{Done, End, compiled, done, has_experiment, load, sound};
+use super::{Done, End, compiled, done_beside, has_experiment, load, sound};
 use crate::args::Run;
 use crate::commands::shared::cross_check::{Crossed, cross};
-use crate::compile::{Loaded, Options, Stages, Stopwatch};
+use crate::compile::{Case, Loaded, Options, Stages, Stopwatch};
+use crate::figure::{self, Recorded};
 use crate::plot::{self, Figure};
 use crate::results::{self, Ran};
 use crate::terminal::{Style, Terminal};
-use crate::{figure, project, report};
+use crate::timings::Timings;
+use crate::{project, report};
 use grammar::diagnostic::Diagnostic;
 use runtime::engine::Continue;
 use runtime::engine::even_grid;
-use runtime::record::csv;
+use runtime::record::{Recording, csv};
 use serde_json::json;
 use std::path::{Path, PathBuf};
+use std::time::Instant;
 
-pub fn run(args: &Run, terminal: &mut Terminal) -> End {
+pub fn run(args: &Run, timings: &mut Timings, terminal: &mut Terminal) -> End {
     let mut watch = Stopwatch::start("read");
     let Some(mut loaded) = load(&args.file, terminal, &mut watch) else { return End::Failed };
     let names = match chosen(args, &loaded) {
@@ -44,10 +47,11 @@ pub fn run(args: &Run, terminal: &mut Terminal) -> End {
         return End::Failed;
     }
     let stages = watch.stop();
+    timings.add_all(&stages);
     let options = Options { changes: args.changed.changes(), interpret: args.interpret };
     let mut end = End::Fine;
     for name in &names {
-        if experiment(args, &mut loaded, name, &options, &stages, terminal) != End::Fine {
+        if experiment(args, &mut loaded, name, &options, &stages, timings, terminal) != End::Fine {
             end = End::Failed;
         }
     }
@@ -76,6 +80,7 @@ fn experiment(
     name: &str,
     options: &Options,
     before: &Stages,
+    timings: &mut Timings,
     terminal: &mut Terminal,
 ) -> End {
     let file = args.file.display().to_string();
@@ -123,16 +128,30 @@ fn experiment(
             return End::Failed;
         }
     };
-    let done = done(cases, stages, !talking, !args.trust.no_error);
+    stages.0.iter().skip(before.0.len()).for_each(|(stage, seconds)| timings.add(stage, *seconds));
+    // Files are written before anything is said: they exist even if the reader of our output has gone.
+    let errors = !args.trust.no_error;
+    let files = |cases: &[Case], recordings: &[Recording]| {
+        let begin = Instant::now();
+        let drawn = drawn(name, cases, recordings);
+        let written = write(args, name, cases, recordings, &grids, drawn.as_ref());
+        (drawn, written, begin.elapsed().as_secs_f64())
+    };
+    let (done, (drawn, written, of_files)) = done_beside(cases, stages, !talking, errors, files);
+    timings.add("run", done.wall);
+    match errors {
+        true => {
+            timings.add("errors", done.judging);
+            timings.add_meanwhile("files", of_files);
+        }
+        false => timings.add("files", of_files),
+    }
     let crossed: Option<Vec<Crossed>> = match args.cross {
         true => cross(loaded, name, options, &done.cases, terminal),
         false => Some(Vec::new()),
     };
     let mut passed = crossed.as_ref().is_some_and(|all| all.iter().all(Crossed::passed));
     let crossed = crossed.unwrap_or_default();
-    let drawn = drawn(name, &done);
-    // Files are written first: they exist even if the reader of our output has gone.
-    let written = write(args, name, &done, &grids, drawn.as_ref());
     for (k, (case, result)) in done.cases.iter().zip(&done.results).enumerate() {
         let ran = Ran {
             file: &file,
@@ -191,14 +210,19 @@ fn place(loaded: &Loaded, name: &str) -> String {
 }
 
 /// All recordings in one figure; none if the experiment plots nothing.
-fn drawn(name: &str, done: &Done) -> Option<Figure> {
-    let first = done.cases.first()?;
+fn drawn(name: &str, cases: &[Case], recordings: &[Recording]) -> Option<Figure> {
+    let first = cases.first()?;
     if first.experiment.plots.is_empty() {
         return None;
     }
-    let cases = figure::recorded(&done.cases, &done.results);
+    let cases = recorded(cases, recordings);
     let subtitle = format!("{}, {}", first.instance.description().name, results::solver(&first.experiment.solver));
     Some(figure::figure(name, &subtitle, &first.experiment.plots, &cases))
+}
+
+/// The recordings with the labels of their cases.
+fn recorded<'a>(cases: &'a [Case], recordings: &'a [Recording]) -> Vec<Recorded<'a>> {
+    cases.iter().map(|case| case.label.as_str()).zip(recordings).collect()
 }
 
 /// Writes the requested files; returns their paths, or the one that failed and why. `grids`: the instants of each case
@@ -206,7 +230,8 @@ fn drawn(name: &str, done: &Done) -> Option<Figure> {
 fn write(
     args: &Run,
     name: &str,
-    done: &Done,
+    cases: &[Case],
+    recordings: &[Recording],
     grids: &[Vec<f64>],
     drawn: Option<&Figure>,
 ) -> Result<Vec<PathBuf>, (PathBuf, std::io::Error)> {
@@ -218,10 +243,10 @@ fn write(
             let png = path.extension().is_some_and(|extension| extension == "png");
             files.push((path, if png { plot::png(figure) } else { plot::svg(figure).into_bytes() }));
         }
-        for (k, (label, recording)) in figure::recorded(&done.cases, &done.results).into_iter().enumerate() {
+        for (k, (label, recording)) in recorded(cases, recordings).into_iter().enumerate() {
             let mut bytes = Vec::new();
             let evenly = grids.get(k).map(|grid| {
-                let case = &done.cases[k];
+                let case = &cases[k];
                 // How the run ends has been reported for the first one.
                 even_grid::record(case.instance.clone(), &case.experiment, grid, &mut |_| Continue::Continue(())).0
             });

@@ -8,9 +8,10 @@ use crate::project;
 use crate::quantity::duration;
 use crate::results;
 use crate::terminal::{Style, Terminal};
+use crate::timings::Timings;
 use std::path::PathBuf;
 
-pub fn test(args: &Test, terminal: &mut Terminal) -> End {
+pub fn test(args: &Test, timings: &mut Timings, terminal: &mut Terminal) -> End {
     let mut tally = Tally::default();
     let mut files: Vec<PathBuf> = Vec::new();
     for path in &args.paths {
@@ -37,13 +38,14 @@ pub fn test(args: &Test, terminal: &mut Terminal) -> End {
             continue;
         }
         let stages = watch.stop();
+        timings.add_all(&stages);
         let names: Vec<String> =
             loaded.experiments().into_iter().filter(|info| info.has_expect).map(|info| info.name).collect();
         if !args.quiet && !names.is_empty() {
             terminal.line(&file.display().to_string());
         }
         for name in names {
-            tally.add(experiment(args, &mut loaded, &name, &stages, terminal));
+            tally.add(experiment(args, &mut loaded, &name, timings, terminal));
         }
     }
     if tally.passed + tally.failed == 0 {
@@ -66,13 +68,16 @@ impl Tally {
 }
 
 /// Runs one experiment; returns whether its expectations hold in every case.
-fn experiment(args: &Test, loaded: &mut Loaded, name: &str, before: &Stages, terminal: &mut Terminal) -> bool {
+fn experiment(args: &Test, loaded: &mut Loaded, name: &str, timings: &mut Timings, terminal: &mut Terminal) -> bool {
     let options = Options { interpret: args.interpret, ..Options::default() };
-    let Ok((cases, stages)) = compiled(loaded, name, &options, before, false, terminal) else {
+    let Ok((cases, stages)) = compiled(loaded, name, &options, &Stages::default(), false, terminal) else {
         terminal.line(&line(terminal, false, name, ""));
         return false;
     };
+    timings.add_all(&stages);
     let done = done(cases, stages, args.quiet, !args.trust.no_error);
+    timings.add("run", done.wall);
+    timings.add("errors", done.judging);
     let held = done.results.iter().all(|result| result.as_ref().is_ok_and(runtime::engine::Outcome::passed));
     let crossed = match args.cross && held {
         true => cross(loaded, name, &options, &done.cases, terminal),

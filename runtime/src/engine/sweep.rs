@@ -47,7 +47,11 @@ pub fn run(cases: &[Case], watch: &(dyn Fn(f64) -> Continue + Sync)) -> Vec<Resu
         };
         engine::run(case.instance.clone(), &case.experiment, &mut report)
     };
-    cases.par_iter().with_max_len(1).map(run).collect()
+    // One run needs no pool of threads, whose start takes as long as a short run.
+    match cases {
+        [one] => vec![run(one)],
+        cases => cases.par_iter().with_max_len(1).map(run).collect(),
+    }
 }
 
 /// Estimates the errors of all outcomes, as [`estimate::judge`] does.
@@ -57,7 +61,10 @@ pub fn judge(cases: &[Case], results: &mut [Result<Outcome, Failure>], watch: &(
             estimate::judge(&case.instance, &case.experiment, outcome, &mut |done| watch(done));
         }
     };
-    cases.par_iter().zip(results).with_max_len(1).for_each(judge);
+    match cases {
+        [_] => cases.iter().zip(results).for_each(judge),
+        cases => cases.par_iter().zip(results).with_max_len(1).for_each(judge),
+    }
 }
 
 /// For each thread, the most results that may wait for an earlier one: more than there are lanes.
