@@ -34,9 +34,9 @@ pub fn doctor() -> String {
         "a constant processor clock",
         "`echo performance | tee /sys/devices/system/cpu/cpu*/cpufreq/scaling_governor`",
     );
-    let entered = threads::enter(&Wishes { priority: 80, core, memory: true, awake: true });
+    let entered = threads::enter(&Wishes::of_cycle());
     let refused = entered.refused();
     line(refused.is_empty(), "priority, memory and wakefulness granted", "see below");
-    lines.extend(refused.iter().map(|refusal| format!("  {:?}: {}; {}", refusal.what, refusal.reason, refusal.remedy)));
+    lines.extend(refused.iter().map(|refusal| format!("  {refusal}")));
     lines.join("\n") + "\n"
 }

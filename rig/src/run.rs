@@ -7,17 +7,15 @@ use crate::packed::{self, Open};
 use crate::store::Store;
 use crate::words;
 use abi::rig::Rig;
-use runtime::can::address::Address;
+use runtime::can::Bus;
 use runtime::can::sim::Simulation;
-use runtime::can::{self, Bus};
-use runtime::drive::polarity_check::SignTest;
-use runtime::hil::cycle::{Command, End, Gauges, Hil, Options, look_ahead};
+use runtime::hil::cycle::{Command, End, Gauges};
 use runtime::hil::live::Judge;
 use runtime::hil::operator::{Answer, NO_RESET, Operator, Stamp, Stopper, Why};
-use runtime::hil::simulated::{MASTER, Pace, World, holds_and_pushes};
-use runtime::hil::{emergency, watches, words as told};
+use runtime::hil::session::{self, Drives, Session, Setup};
+use runtime::hil::simulated::World;
+use runtime::hil::{emergency, watches};
 use runtime::realtime::clock::Clock;
-use runtime::realtime::threads::{self, Wishes};
 use runtime::record::log::{Sections, Settings, Sink};
 use runtime::record::parts::{self, Limits};
 use std::fs;
@@ -28,13 +26,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
-/// Longest recording that a killed process may lose.
-const BLOCK_NS: u64 = 100_000_000;
 /// Interval at which the state is written and the installed package checked.
 const LOOK: Duration = Duration::from_millis(100);
-/// [`Gauges::stage`] from which on drives may have torque, and that of torque off after a stop.
-const ENABLE: u64 = runtime::drive::Step::Enable as u64;
-const TORQUE_OFF: u64 = 103;
 
 /// Arguments of a run.
 pub struct Wanted<'a> {
@@ -119,86 +112,68 @@ pub fn run(wanted: &Wanted) -> Result<u8, String> {
 
 fn once(wanted: &Wanted, open: &Open, store: &Store, target: &Path) -> Result<Ended, String> {
     if wanted.fast && wanted.duration.is_none() && !wanted.check {
-        return Err("--fast needs --for TIME: simulated time has no operator who would end the run".into());
+        return Err(session::FAST_WITHOUT_END.into());
     }
     let mut rig = open.contents.rig.clone();
-    for (bus, address) in wanted.buses {
-        let Some(known) = rig.buses.iter_mut().find(|known| known.name == *bus) else {
-            let names: Vec<&str> = rig.buses.iter().map(|bus| bus.name.as_str()).collect();
-            return Err(format!("rig `{}` has no bus `{bus}`; it has {}", rig.name, names.join(", ")));
-        };
-        known.address.clone_from(address);
-    }
+    session::readdress(&mut rig, wanted.buses)?;
     open.may_run(&rig.buses, wanted.sim, wanted.allow_unsigned)?;
     let control = open.program("control")?;
     let judge = open.judge(&control)?;
-    let log = log(wanted, open, &rig)?;
+    let drives = Drives::of(&rig, wanted.sim, wanted.fast);
+    let log = log(wanted, open, &rig, drives)?;
     let path = match &log.0.sink {
         Sink::File(path, _) | Sink::BlackBox(path, _) => path.clone(),
     };
-    let simulated = wanted.sim || rig.buses.iter().all(|bus| bus.address.starts_with("sim:"));
-    let mut options = Options { arms_itself: simulated, checks_only: wanted.check, ..Options::default() };
-    options.start.simulated = simulated;
-    // Delays between this process and itself say nothing about the drives.
-    options.start.missed = if simulated { 0.05 } else { 0.0 };
-    if simulated && holds_and_pushes(&rig) {
-        options.start.sign_test = SignTest::Skip;
-    }
+    let mut options = session::options(&rig, &open.program("plant")?, drives)?;
+    options.checks_only = wanted.check;
     options.duration_ns = wanted.duration.map(|seconds| (seconds * 1e9).round() as u64);
-    options.look = look_ahead(&rig, &open.program("plant")?)?;
-    options.control.needs_look = rig.needs_look;
-    let fast = simulated && wanted.fast;
-    // With simulated time the step time does not matter.
-    if let Some(why) = watches::too_slow(&rig, &control).filter(|_| !fast) {
+    // In simulated time the duration of a step does not matter.
+    if let Some(why) = watches::too_slow(&rig, &control).filter(|_| !drives.is_fast()) {
         return Err(format!("refused: {why}"));
     }
-    let world;
-    let (clock, buses): (Box<dyn Clock>, Vec<Box<dyn Bus>>) = if simulated {
-        let pace = if fast { Pace::Fast } else { Pace::Wall };
-        let mut made = World::new(&rig, Some(open.program("plant")?), pace, 1)?;
-        let both = (made.clock(), made.masters());
-        world = Some(made);
-        both
-    } else {
-        world = None;
-        let time = Simulation::real_time();
-        let buses = buses(&rig, &time)?;
-        (Box::new(time), buses)
+    let _world;
+    let (clock, buses): (Box<dyn Clock>, Vec<Box<dyn Bus>>) = match drives {
+        Drives::Simulated(pace) => {
+            let mut made = World::new(&rig, Some(open.program("plant")?), pace, 1)?;
+            let both = (made.clock(), made.masters());
+            _world = made;
+            both
+        }
+        Drives::Real => {
+            let time = Simulation::real_time();
+            let buses = session::buses(&rig, &time)?;
+            (Box::new(time), buses)
+        }
     };
-    let real_time = (!fast)
-        .then(|| threads::enter(&Wishes { priority: 80, core: threads::isolated_core(), memory: true, awake: true }));
-    let refused: Vec<String> = real_time.iter().flat_map(|it| it.refused()).map(|it| format!("{it:?}")).collect();
-    if !simulated && !refused.is_empty() {
-        options.only_simulated = Some("this computer gives no real time: `fric-rig doctor` says why".into());
-    }
-    let (mut hil, operator) = Hil::new(&rig, control, clock, buses, options, Some(log))?;
-    hil.judged_by(judge.clone());
-    if !fast {
-        let watchdog = emergency::Watchdog::new(Duration::from_nanos(rig.watchdog_ns), emergency::send);
-        hil.watched_by(watchdog.map_err(|error| format!("no watchdog: {error}"))?);
-        hil.prepare_emergency();
-    }
+    let setup = Setup {
+        rig: &rig,
+        control,
+        drives,
+        options,
+        log: Some(log),
+        judge: Some(judge.clone()),
+        needs_real_time: "this computer gives no real time: `fric-rig doctor` says why",
+    };
+    let mut session = Session::start(setup, clock, buses)?;
     words::print(&format!(
         "{}: {} Hz, {}\n",
         rig.name,
         1e9 / rig.period_ns as f64,
-        if simulated { "simulated drives" } else { "drives on their buses" }
+        if drives.are_simulated() { "simulated drives" } else { "drives on their buses" }
     ));
     for lack in watches::lacking(&rig) {
         words::print(&format!("  note: {lack}\n"));
     }
-    let attendant = (!fast).then(|| Attendant::new(wanted, store, target, hil.gauges(), operator.by_the_wall(), judge));
-    let end = hil.run();
-    let seen =
-        |flag: fn(&Attendant) -> &AtomicBool| attendant.as_ref().is_some_and(|it| flag(it).load(Ordering::Relaxed));
-    let (replaced, waited) = (seen(|it| &it.replaced), seen(|it| &it.waited));
+    let operator = session.operator().filter(|_| !drives.is_fast());
+    let gauges = session.hil.gauges();
+    let attendant =
+        operator.map(|operator| Attendant::new(wanted, store, target, gauges, operator.by_the_wall(), judge));
+    let end = session.run();
+    let replaced = attendant.as_ref().is_some_and(|attendant| attendant.replaced.load(Ordering::Relaxed));
     drop(attendant);
-    drop(real_time);
-    drop(world);
-    let counts = told::counts(hil.counts());
-    let written = hil.finish();
-    words::print(&counts.lines().map(|line| format!("  {line}\n")).collect::<String>());
-    match written {
+    let finished = session.finish();
+    words::print(&finished.counts.lines().map(|line| format!("  {line}\n")).collect::<String>());
+    match finished.log {
         Ok(Some(summary)) => words::print(&format!("  wrote {}\n", summary.words(&path))),
         Ok(None) => {}
         Err(error) => return Err(format!("the log {} is not whole: {error}", path.display())),
@@ -210,47 +185,30 @@ fn once(wanted: &Wanted, open: &Open, store: &Store, target: &Path) -> Result<En
     match end {
         End::Asked if replaced || goes_on => Ok(Ended::Replaced),
         End::Asked => Ok(Ended::Asked),
-        End::Refused(why) if waited => Ok(Ended::Lost(why)),
+        End::Refused(why) if finished.has_started => Ok(Ended::Lost(why)),
         End::Refused(why) => Err(format!("refused: {why}")),
         End::Stopped(_, why) => Ok(Ended::Stopped(why)),
     }
 }
 
-/// Opens the buses of this computer.
-fn buses(rig: &Rig, time: &Simulation) -> Result<Vec<Box<dyn Bus>>, String> {
-    let open = |bus: &abi::rig::Bus| {
-        let options = can::Options { bit_rate: Some(bus.bit_rate).filter(|rate| *rate > 0), ..can::Options::default() };
-        let address = bus.address.parse::<Address>().map_err(|why| why.to_string());
-        address
-            .and_then(|address| can::open(&address, &options, time, MASTER).map_err(|why| why.to_string()))
-            .map_err(|why| format!("bus `{}`: {why}; --bus {}=ADDRESS puts another under it", bus.name, bus.name))
-    };
-    rig.buses.iter().map(open).collect()
-}
-
 /// File and head of the recording; the head contains everything that a replay needs.
-fn log(wanted: &Wanted, open: &Open, rig: &Rig) -> Result<(Settings, Sections), String> {
-    let mut head = open.head();
-    let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
-    let repeatable = wanted.fast && wanted.sim;
-    let started =
-        if repeatable { String::new() } else { format!("{}.{:09} s since 1970", now.as_secs(), now.subsec_nanos()) };
-    head = head.with("started", started).with("package", runtime::package::hash(&open.bytes));
+fn log(wanted: &Wanted, open: &Open, rig: &Rig, drives: Drives) -> Result<(Settings, Sections), String> {
+    let head = open.head();
+    let head = head.with("started", session::started(drives)).with("package", runtime::package::hash(&open.bytes));
     let path = match wanted.log {
         Some(path) => path.to_path_buf(),
-        None => wanted.dir.join("log").join(format!("{}-{}.friclog", rig.name, now.as_millis())),
+        None => {
+            let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+            wanted.dir.join("log").join(format!("{}-{}.friclog", rig.name, now.as_millis()))
+        }
     };
-    let cycles_per_block = u32::try_from((BLOCK_NS / rig.period_ns).max(1)).unwrap_or(u32::MAX);
-    let settings = Settings { sink: Sink::File(path, wanted.limits), cycles_per_block, patient: repeatable };
-    Ok((settings, head))
+    Ok((session::log_settings(rig, Sink::File(path, wanted.limits), drives), head))
 }
 
 /// Threads beside the cycle: they write the state, accept commands, and detect that another package has been installed.
 struct Attendant {
     over: Arc<AtomicBool>,
     replaced: Arc<AtomicBool>,
-    /// Whether the rig has passed its start-up checks and waited for its operator.
-    waited: Arc<AtomicBool>,
     threads: Vec<std::thread::JoinHandle<()>>,
     dir: PathBuf,
 }
@@ -264,22 +222,20 @@ impl Attendant {
         operator: Operator,
         judge: Judge,
     ) -> Attendant {
-        let [over, replaced, waited] = [(); 3].map(|()| Arc::new(AtomicBool::new(false)));
+        let [over, replaced] = [(); 2].map(|()| Arc::new(AtomicBool::new(false)));
         let stopper = operator.stopper();
         let desk = Arc::new(Desk { operator: Mutex::new(operator), stopper: stopper.clone(), judge });
         let dir = wanted.dir.to_path_buf();
         let mut threads = Vec::new();
         {
-            let [over, replaced, waited] = [&over, &replaced, &waited].map(Arc::clone);
+            let [over, replaced] = [&over, &replaced].map(Arc::clone);
             let dir = dir.clone();
             let installed = wanted.package.is_none().then(|| store.clone());
             let target = target.to_path_buf();
             threads.push(std::thread::spawn(move || {
                 while !over.load(Ordering::Relaxed) {
                     tell(&dir, &target, &gauges);
-                    let stage = gauges.stage.load(Ordering::Relaxed);
-                    waited.fetch_or(stage >= ENABLE, Ordering::Relaxed);
-                    let idle = stage < ENABLE || stage == TORQUE_OFF;
+                    let idle = gauges.stage.get().is_idle();
                     let other =
                         installed.as_ref().is_some_and(|store| store.current_target().as_ref() != Some(&target));
                     if other && idle && !replaced.swap(true, Ordering::Relaxed) {
@@ -305,7 +261,7 @@ impl Attendant {
                 }
             }));
         }
-        Attendant { over, replaced, waited, threads, dir }
+        Attendant { over, replaced, threads, dir }
     }
 }
 
@@ -332,7 +288,7 @@ fn tell(dir: &Path, target: &Path, gauges: &Gauges) {
     let text = format!(
         "{}: {}, {} cycles, late {} us at most, {} missed{}\n",
         target.display(),
-        told::stage(number(&gauges.stage)),
+        gauges.stage.get(),
         number(&gauges.cycles),
         number(&gauges.late_ns_max) / 1000,
         number(&gauges.missed),

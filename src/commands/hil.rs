@@ -8,19 +8,18 @@ use crate::source_snapshot::Keeping;
 use crate::terminal::{Style, Terminal};
 use crate::{loop_stability, project, quantity, report};
 use abi::rig::Rig;
-use runtime::can::address::Address;
+use runtime::can::Bus;
 use runtime::can::sim::Simulation;
-use runtime::can::{self, Bus};
-use runtime::drive::polarity_check::SignTest;
 use runtime::drive::profiles::Life;
 use runtime::hil::control::PATIENT_NS;
 use runtime::hil::cycle::{Gauges, Hil, Options as HilOptions};
 use runtime::hil::identify::{self, Identification};
 use runtime::hil::live::Judge;
-use runtime::hil::simulated::{MASTER, Pace, World, holds_and_pushes};
+use runtime::hil::session::{self, Drives, Finished, Session, Setup};
+use runtime::hil::simulated::{Pace, World};
 use runtime::hil::{cycle, emergency, watches, words};
 use runtime::realtime::clock::Clock;
-use runtime::realtime::threads::{self, Wishes};
+use runtime::realtime::threads::Refusal;
 use runtime::record::log::{Sections, Settings, Sink};
 use runtime::record::parts::{self, Limits};
 use std::io::IsTerminal;
@@ -29,8 +28,6 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-/// Most time of a recording that is lost when the process is killed.
-const BLOCK_NS: u64 = 100_000_000;
 /// Length of the black box.
 const BLACK_BOX_NS: u64 = 10_000_000_000;
 
@@ -54,16 +51,12 @@ pub fn hil(args: &Args, terminal: &mut Terminal) -> End {
         terminal.report(&report::full(&loaded.files.0, &found, terminal.error_colour()));
     }
     let Ok(mut ready) = ready else { return End::Failed };
-    for (bus, address) in &args.bus {
-        let Some(there) = ready.rig.buses.iter_mut().find(|known| known.name == *bus) else {
-            let names: Vec<&str> = ready.rig.buses.iter().map(|bus| bus.name.as_str()).collect();
-            terminal.error(&format!("rig `{name}` has no bus `{bus}`; it has {}", names.join(", ")));
-            return End::Misused;
-        };
-        there.address.clone_from(address);
+    if let Err(why) = session::readdress(&mut ready.rig, &args.bus) {
+        terminal.error(&why);
+        return End::Misused;
     }
-    let simulated = args.sim || ready.rig.buses.iter().all(|bus| bus.address.starts_with("sim:"));
-    if let Err(why) = usage(args, &ready, simulated) {
+    let drives = Drives::of(&ready.rig, args.sim, args.fast);
+    if let Err(why) = usage(args, &ready, drives) {
         terminal.error(&why);
         return End::Misused;
     }
@@ -80,11 +73,11 @@ pub fn hil(args: &Args, terminal: &mut Terminal) -> End {
         .with("file", root.name.as_str())
         .with("source", root.text.as_bytes())
         .with("set", set.join("\n"))
-        .with("started", started(simulated && args.fast));
+        .with("started", session::started(drives));
     let head = keeping.into(head);
-    let log = Some((log_settings(args, &name, &ready, simulated), head.clone()));
+    let log = Some((log_settings(args, &name, &ready, drives), head.clone()));
     if args.identify {
-        return identified(args, ready, simulated, terminal);
+        return identified(args, ready, drives, terminal);
     }
     let Some(needs_look) = bearable(args, &ready, terminal) else { return End::Failed };
     ready.rig.needs_look = needs_look;
@@ -101,7 +94,7 @@ pub fn hil(args: &Args, terminal: &mut Terminal) -> End {
         needs_look,
     };
     let asked = Asked { log, rehearsal: Some(rehearsal), ..Asked::default() };
-    if simulated { in_process(args, ready, asked, terminal) } else { on_buses(args, ready, asked, terminal) }
+    with_buses(args, ready, drives, asked, terminal)
 }
 
 /// Whether the rig is stable only with the predictor; none if it must not run.
@@ -127,11 +120,11 @@ fn bearable(args: &Args, ready: &Ready, terminal: &mut Terminal) -> Option<bool>
 }
 
 /// Rejects combinations of options that exclude each other.
-fn usage(args: &Args, ready: &Ready, simulated: bool) -> Result<(), String> {
-    if simulated && args.fast && args.duration.is_none() && !args.check && !args.identify {
-        return Err("--fast needs --for TIME: simulated time has no operator who would end the run".into());
+fn usage(args: &Args, ready: &Ready, drives: Drives) -> Result<(), String> {
+    if drives.is_fast() && args.duration.is_none() && !args.check && !args.identify {
+        return Err(session::FAST_WITHOUT_END.into());
     }
-    if simulated {
+    if drives.are_simulated() {
         return Ok(());
     }
     if args.fast {
@@ -157,51 +150,40 @@ fn daring(args: &Args) -> Option<&'static str> {
     all.into_iter().find(|(given, _)| *given).map(|(_, name)| name)
 }
 
-/// The start time for the log; empty for a repeatable run, so that equal runs have equal logs.
-fn started(repeatable: bool) -> String {
-    let now = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).unwrap_or_default();
-    if repeatable { String::new() } else { format!("{}.{:09} s since 1970", now.as_secs(), now.subsec_nanos()) }
-}
-
-fn log_settings(args: &Args, name: &str, ready: &Ready, simulated: bool) -> Settings {
-    let cycles = |ns: u64| u32::try_from((ns / ready.rig.period_ns).max(1)).unwrap_or(u32::MAX);
+fn log_settings(args: &Args, name: &str, ready: &Ready, drives: Drives) -> Settings {
     let path = args.log.clone().unwrap_or_else(|| PathBuf::from("out").join(format!("{name}.friclog")));
     let sink = if args.no_log {
         let path = PathBuf::from("out").join(format!("{name}.blackbox.friclog"));
-        Sink::BlackBox(path, (BLACK_BOX_NS / BLOCK_NS) as usize)
+        Sink::BlackBox(path, session::blocks(BLACK_BOX_NS))
     } else {
         Sink::File(path, Limits { part: args.roll, keep: args.keep, ..Limits::default() })
     };
-    let cycles_per_block = cycles(BLOCK_NS);
-    // With frozen time, the log may block the cycle.
-    Settings { sink, cycles_per_block, patient: simulated && args.fast }
+    session::log_settings(&ready.rig, sink, drives)
 }
 
-fn hil_options(args: &Args, rig: &Rig, simulated: bool) -> HilOptions {
-    let mut options = HilOptions::default();
+/// Options of the cycle, or a message about what the rig's predictor lacks.
+fn hil_options(args: &Args, ready: &Ready, drives: Drives) -> Result<HilOptions, String> {
+    let mut options = session::options(&ready.rig, &ready.plant, drives)?;
     options.control.count_overruns = args.count_overruns;
-    options.start.simulated = simulated;
-    // Delays inside this process are no evidence about drives.
-    options.start.missed = match (simulated, args.count_overruns) {
-        (_, true) => 1.0,
-        (true, false) => 0.05,
+    options.control.energy_stops = args.stop_on_energy;
+    if args.count_overruns {
+        options.start.missed = 1.0;
+    } else if !drives.are_simulated() && args.accept_jitter {
         // On a host without real-time scheduling, drives that are programs on it answer late.
-        (false, false) if args.accept_jitter => 0.9,
-        (false, false) => 0.0,
-    };
-    options.start.timeout_test = !args.count_overruns;
-    if simulated && holds_and_pushes(rig) {
-        // A drive that holds its speed would prevent another one from turning the shaft.
-        options.start.sign_test = SignTest::Skip;
+        options.start.missed = 0.9;
     }
-    options.arms_itself = args.sim || simulated || args.arm;
+    options.start.timeout_test = !args.count_overruns;
+    options.arms_itself |= args.arm;
     options.checks_only = args.check;
     options.duration_ns = args.duration.map(|seconds| (seconds * 1e9).round() as u64);
-    options
+    if !drives.are_simulated() {
+        options.only_simulated = daring(args).map(|option| format!("{option} is for simulated drives only"));
+    }
+    Ok(options)
 }
 
 /// Runs torque pulses in place of the model.
-fn identified(args: &Args, mut ready: Ready, simulated: bool, terminal: &mut Terminal) -> End {
+fn identified(args: &Args, mut ready: Ready, drives: Drives, terminal: &mut Terminal) -> End {
     let asked = match Identification::new(&ready.rig) {
         Ok(asked) => asked,
         Err(why) => {
@@ -213,7 +195,7 @@ fn identified(args: &Args, mut ready: Ready, simulated: bool, terminal: &mut Ter
     ready.rig = asked.rig.clone();
     ready.control = asked.program.clone();
     let asked = Asked { pulses: Some(&asked), ..Asked::default() };
-    if simulated { in_process(args, ready, asked, terminal) } else { on_buses(args, ready, asked, terminal) }
+    with_buses(args, ready, drives, asked, terminal)
 }
 
 /// Prints the measured parameters as text to paste.
@@ -243,9 +225,16 @@ struct Asked<'a> {
     rehearsal: Option<Rehearsal>,
 }
 
+/// Runs with the buses of these drives.
+fn with_buses(args: &Args, ready: Ready, drives: Drives, asked: Asked, terminal: &mut Terminal) -> End {
+    match drives {
+        Drives::Simulated(pace) => in_process(args, ready, pace, asked, terminal),
+        Drives::Real => on_buses(args, ready, asked, terminal),
+    }
+}
+
 /// Runs with buses, drives and devices in this process.
-fn in_process(args: &Args, ready: Ready, asked: Asked, terminal: &mut Terminal) -> End {
-    let pace = if args.fast { Pace::Fast } else { Pace::Wall };
+fn in_process(args: &Args, ready: Ready, pace: Pace, asked: Asked, terminal: &mut Terminal) -> End {
     let world = World::new(&ready.rig, Some(ready.plant.clone()), pace, args.seed);
     let mut world = match world {
         Ok(world) => world,
@@ -264,33 +253,20 @@ fn in_process(args: &Args, ready: Ready, asked: Asked, terminal: &mut Terminal) 
         }
     }
     let (clock, masters) = (world.clock(), world.masters());
-    run(args, ready, clock, masters, true, asked, terminal)
+    run(args, ready, clock, masters, Drives::Simulated(pace), asked, terminal)
 }
 
 /// Runs on the buses of this machine.
 fn on_buses(args: &Args, ready: Ready, asked: Asked, terminal: &mut Terminal) -> End {
     let world = Simulation::real_time();
-    let mut buses: Vec<Box<dyn Bus>> = Vec::new();
-    for bus in &ready.rig.buses {
-        let options = can::Options { bit_rate: Some(bus.bit_rate).filter(|rate| *rate > 0), ..can::Options::default() };
-        let open = bus
-            .address
-            .parse::<Address>()
-            .map_err(|why| why.to_string())
-            .and_then(|address| can::open(&address, &options, &world, MASTER).map_err(|why| why.to_string()));
-        match open {
-            Ok(open) => buses.push(open),
-            Err(why) => {
-                terminal.error(&format!("bus `{}`: {why}", bus.name));
-                terminal.report(&format!(
-                    "  `fric hil --sim` runs the rig with simulated drives; --bus {}=ADDRESS puts another bus under it\n",
-                    bus.name
-                ));
-                return End::Failed;
-            }
+    match session::buses(&ready.rig, &world) {
+        Ok(buses) => run(args, ready, Box::new(world), buses, Drives::Real, asked, terminal),
+        Err(why) => {
+            terminal.error(&why);
+            terminal.report("  `fric hil --sim` runs the rig with simulated drives\n");
+            End::Failed
         }
     }
-    run(args, ready, Box::new(world), buses, false, asked, terminal)
 }
 
 fn run(
@@ -298,89 +274,66 @@ fn run(
     ready: Ready,
     clock: Box<dyn Clock>,
     buses: Vec<Box<dyn Bus>>,
-    simulated: bool,
+    drives: Drives,
     asked: Asked,
     terminal: &mut Terminal,
 ) -> End {
     let Asked { log, pulses: asked, rehearsal } = asked;
-    let Ready { rig, control, plant, notes, .. } = ready;
     let log_path = log.as_ref().map(|(settings, _)| match &settings.sink {
         Sink::File(path, _) | Sink::BlackBox(path, _) => path.clone(),
     });
-    let fast = simulated && args.fast;
-    let mut options = hil_options(args, &rig, simulated);
-    options.control.needs_look = rig.needs_look;
-    options.control.energy_stops = args.stop_on_energy;
-    match cycle::look_ahead(&rig, &plant) {
-        Ok(look) => options.look = look,
-        Err(why) => {
-            terminal.error(&why);
-            return End::Failed;
+    let started = hil_options(args, &ready, drives).and_then(|mut options| {
+        if let Some(asked) = asked {
+            options.duration_ns = Some(asked.duration_ns);
+            options.control.ramp_ns = 0;
+            options.control.measures = true;
         }
-    }
-    if let Some(asked) = asked {
-        options.duration_ns = Some(asked.duration_ns);
-        options.control.ramp_ns = 0;
-        options.control.measures = true;
-    }
-    let real_time = (!fast)
-        .then(|| threads::enter(&Wishes { priority: 80, core: threads::isolated_core(), memory: true, awake: true }));
-    let refusals: Vec<String> = real_time.iter().flat_map(|real_time| real_time.refused()).map(said).collect();
-    if !simulated {
-        options.only_simulated = daring(args).map(|option| format!("{option} is for simulated drives only"));
-        if !refusals.is_empty() && options.only_simulated.is_none() {
-            options.only_simulated = Some("this host gives no real time, see above".into());
-        }
-    }
-    let (mut hil, operator) = match Hil::new(&rig, control, clock, buses, options, log) {
-        Ok(made) => made,
+        let setup = Setup {
+            rig: &ready.rig,
+            control: ready.control.clone(),
+            drives,
+            options,
+            log,
+            judge: rehearsal.as_ref().map(|rehearsal| rehearsal.judge.clone()),
+            needs_real_time: "this host gives no real time, see above",
+        };
+        Session::start(setup, clock, buses)
+    });
+    let mut session = match started {
+        Ok(session) => session,
         Err(why) => {
             terminal.error(&why);
             return End::Failed;
         }
     };
-    if let Some(rehearsal) = &rehearsal {
-        hil.judged_by(rehearsal.judge.clone());
-    }
-    if !fast {
-        let patience = Duration::from_nanos(rig.watchdog_ns);
-        match emergency::Watchdog::new(patience, emergency::send) {
-            Ok(watchdog) => hil.watched_by(watchdog),
-            Err(error) => {
-                terminal.error(&format!("no watchdog: {error}"));
-                return End::Failed;
-            }
-        }
-        hil.prepare_emergency();
-    }
+    let rig = &ready.rig;
     if !args.quiet {
-        begin(&rig, simulated, fast, &refusals, &notes, terminal);
+        begin(rig, drives, session.refused(), &ready.notes, terminal);
         log_path.iter().filter(|_| !args.no_log).for_each(|path| terminal.line(&room(path)));
     }
     let over = Arc::new(AtomicBool::new(false));
-    let view = (!args.quiet && !fast && std::io::stdout().is_terminal()).then(|| {
-        let (gauges, rig, over) = (hil.gauges(), rig.clone(), over.clone());
+    let view = (!args.quiet && !drives.is_fast() && std::io::stdout().is_terminal()).then(|| {
+        let (gauges, rig, over) = (session.hil.gauges(), rig.clone(), over.clone());
         std::thread::spawn(move || view(&gauges, &rig, &over))
     });
-    if !fast {
+    if let Some(operator) = session.operator().filter(|_| !drives.is_fast()) {
         std::thread::spawn(move || prompt(operator.by_the_wall(), rehearsal));
     }
     if let Some(asked) = asked {
-        let rows = identify::rows(&mut hil, asked);
-        if hil.ended() == Some(&cycle::End::Asked) && rows.len() >= asked.drives().len() * 10 {
+        let rows = identify::rows(&mut session.hil, asked);
+        if session.hil.ended() == Some(&cycle::End::Asked) && rows.len() >= asked.drives().len() * 10 {
             measured(asked, &rows, terminal);
         }
     }
-    let end = hil.ended().cloned().unwrap_or_else(|| hil.run());
+    let end = session.run();
     over.store(true, Ordering::Relaxed);
     if let Some(view) = view {
         let _ = view.join();
     }
-    drop(real_time);
-    if hil.is_checked() {
-        checked(&rig, &hil, terminal);
+    if session.hil.is_checked() {
+        checked(rig, &session.hil, terminal);
     }
-    finish(args, hil, end, log_path, terminal)
+    finish(args, session.finish(), end, log_path, terminal)
 }
 
 /// Prints what `--check` found for each drive, and that there were no problems.
@@ -410,17 +363,12 @@ fn checked(rig: &Rig, hil: &Hil, terminal: &mut Terminal) {
     terminal.line("  checks passed: nothing was armed");
 }
 
-/// The request that the host refused, and the remedy.
-fn said(refusal: &threads::Refusal) -> String {
-    format!("{:?}: {}; {}", refusal.what, refusal.reason, refusal.remedy)
-}
-
-fn begin(rig: &Rig, simulated: bool, fast: bool, refusals: &[String], notes: &[String], terminal: &mut Terminal) {
+fn begin(rig: &Rig, drives: Drives, refused: &[Refusal], notes: &[String], terminal: &mut Terminal) {
     let rate = 1e9 / rig.period_ns as f64;
-    let kind = match (simulated, fast) {
-        (false, _) => "drives on their buses",
-        (true, false) => "simulated drives, wall-clock time",
-        (true, true) => "simulated drives, simulated time",
+    let kind = match drives {
+        Drives::Real => "drives on their buses",
+        Drives::Simulated(Pace::Wall) => "simulated drives, wall-clock time",
+        Drives::Simulated(Pace::Fast) => "simulated drives, simulated time",
     };
     terminal.line(&format!(
         "{}  {} Hz, {kind}",
@@ -433,9 +381,9 @@ fn begin(rig: &Rig, simulated: bool, fast: bool, refusals: &[String], notes: &[S
     for lack in watches::lacking(rig) {
         terminal.line(&format!("  note: {lack}"));
     }
-    if !refusals.is_empty() {
+    if !refused.is_empty() {
         terminal.line("  not real time on this host:");
-        refusals.iter().for_each(|refusal| terminal.line(&format!("    {refusal}")));
+        refused.iter().for_each(|refusal| terminal.line(&format!("    {refusal}")));
     }
 }
 
@@ -448,11 +396,8 @@ fn room(log: &Path) -> String {
 }
 
 /// Reports how the run ended, after the log was closed.
-fn finish(args: &Args, hil: Hil, end: cycle::End, log: Option<PathBuf>, terminal: &mut Terminal) -> End {
-    let counts = words::counts(hil.counts());
-    let missed = hil.counts().missed;
-    let misuse = hil.is_misuse();
-    let written = hil.finish();
+fn finish(args: &Args, finished: Finished, end: cycle::End, log: Option<PathBuf>, terminal: &mut Terminal) -> End {
+    let Finished { counts, missed, misuse, log: written, .. } = finished;
     if !args.quiet {
         for line in counts.lines() {
             terminal.line(&format!("  {line}"));
@@ -510,7 +455,7 @@ fn view(gauges: &Gauges, rig: &Rig, over: &AtomicBool) {
         let micro = |ns: u64| quantity::significant(ns as f64 * 1e-3, 3);
         let mut text = format!(
             "\x1b[2K  {:<32} {:>9.3} s   late {} µs, at most {} µs   {} missed{}\n",
-            words::stage(number(&gauges.stage)),
+            gauges.stage.get().to_string(),
             number(&gauges.cycles) as f64 * rig.period_ns as f64 * 1e-9,
             micro(number(&gauges.late_ns)),
             micro(number(&gauges.late_ns_max)),

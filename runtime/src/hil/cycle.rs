@@ -13,6 +13,7 @@ use super::counts::Counts;
 use super::live::{Judge, Objection};
 use super::operator::{self, Answer, Commands, Why};
 pub use super::operator::{Command, Operator};
+use super::stage::{Stage, StageGauge};
 use super::trace::{self, Passed, Shape};
 use super::watches::Bounds;
 use super::{control, emergency, watches};
@@ -88,8 +89,8 @@ pub struct Gauges {
     pub now_ns: AtomicU64,
     /// Number of cycles in which the model ran.
     pub cycles: AtomicU64,
-    /// [`Step`] of the start-up as a number, or 100 plus the number of the [`DriveCommand`] once that is a stop.
-    pub stage: AtomicU64,
+    /// What the rig does.
+    pub stage: StageGauge,
     /// Lateness of the last cycle's start, ns.
     pub late_ns: AtomicU64,
     /// Greatest lateness of a cycle's start, ns.
@@ -218,6 +219,8 @@ pub struct Hil {
     resting_ns: Option<u64>,
     counts: Counts,
     misuse: bool,
+    /// The start-up has reached [`Step::AwaitEnable`].
+    has_started: bool,
     /// The start-up has finished, and only its checks were requested.
     checked: bool,
     end: Option<End>,
@@ -289,6 +292,7 @@ impl Hil {
             resting_ns: None,
             counts: Counts::default(),
             misuse: false,
+            has_started: false,
             checked: false,
             end: None,
         };
@@ -358,6 +362,11 @@ impl Hil {
     /// Whether all checks of the start-up have passed, in a run of checks only.
     pub fn is_checked(&self) -> bool {
         self.checked
+    }
+
+    /// Whether the start-up has passed all checks that need no torque, and has waited for its operator.
+    pub fn has_started(&self) -> bool {
+        self.has_started
     }
 
     /// Whether the start was refused because an option is for simulated drives only.
@@ -511,12 +520,8 @@ impl Hil {
         }
     }
 
-    /// Value of the gauge `stage`, for start-up and stop.
-    fn stage(&self) -> u64 {
-        match self.order {
-            DriveCommand::Wait | DriveCommand::Follow => self.fieldbus.step() as u64,
-            order => 100 + trace::order_number(order),
-        }
+    fn stage(&self) -> Stage {
+        Stage::of(self.fieldbus.step(), self.order)
     }
 
     fn stop(&mut self) {
@@ -708,6 +713,7 @@ impl Hil {
     #[cfg_attr(rtsan, sanitize(realtime = "nonblocking"))]
     fn count(&mut self, ticks: u32) {
         let stage = self.stage();
+        self.has_started |= self.fieldbus.step() == Step::AwaitEnable;
         let counts = &mut self.counts;
         counts.all += 1;
         let armed = self.control.as_ref().is_some_and(|control| control.supervisor().is_armed());
@@ -743,7 +749,7 @@ impl Hil {
         gauges.late_ns_max.fetch_max(if runs { self.cycle.late_ns.into() } else { 0 }, Ordering::Relaxed);
         gauges.missed.store(counts.missed, Ordering::Relaxed);
         gauges.log_free.store(self.log.as_ref().map_or(0, Log::free), Ordering::Relaxed);
-        gauges.stage.store(stage, Ordering::Relaxed);
+        gauges.stage.set(stage);
         for (gauge, value) in gauges.values.iter().zip(self.cycle.permitted.iter().chain(&self.cycle.recorded)) {
             gauge.store(value.to_bits(), Ordering::Relaxed);
         }

@@ -14,10 +14,12 @@ pub mod replay;
 pub mod emergency;
 pub mod counts;
 pub mod words;
+pub mod stage;
 pub mod operator;
 pub mod cycle;
 pub mod identify;
 pub mod simulated;
+pub mod session;
 
 #[cfg(test)]
 mod tests;

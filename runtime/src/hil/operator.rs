@@ -6,7 +6,7 @@
 //! blocks nor allocates, because no more commands can be open than there are places for answers.
 
 use super::live::{Objection, Set};
-use super::words;
+use super::stage::Stage;
 use crate::realtime::clock::monotonic_ns;
 use crate::safety::{Protection, is_present};
 use crate::spsc::{Receiver, Sender, queue};
@@ -68,8 +68,8 @@ pub enum Answer {
 pub enum Why {
     /// It waited for this time, ns.
     Old(u64),
-    /// It is not permitted in this stage; the value of the gauge `stage`.
-    NotNow(u64),
+    /// It is not permitted in this stage.
+    NotNow(Stage),
     /// The rig is stopping.
     Stopping,
     /// No judge decides which parameters may change.
@@ -87,7 +87,7 @@ impl Why {
     pub fn words(&self) -> String {
         match self {
             Why::Old(ns) => format!("it is {:.1} s old: say it again", *ns as f64 * 1e-9),
-            Why::NotNow(stage) => format!("it has no effect now: the rig is {}", words::stage(*stage)),
+            Why::NotNow(stage) => format!("it has no effect now: the rig is {stage}"),
             Why::Stopping => "the rig was told to stop".into(),
             Why::Unjudged => "no parameter of this rig may change while it runs".into(),
             Why::Set(objection) => format!("{objection:?}"),

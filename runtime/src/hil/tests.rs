@@ -5,6 +5,7 @@ use super::cycle::{End, Hil, Options, look_ahead};
 use super::replay::{Replay, Stopped};
 use super::simulated::{Pace, World};
 use super::trace;
+use crate::drive::Step;
 use crate::record::log::{Reader, Sections, Settings, Sink};
 use crate::record::parts::Limits;
 use crate::testing::rigs;
@@ -149,4 +150,27 @@ fn a_rig_with_missing_drives_is_refused() {
     let End::Refused(why) = hil.run() else { panic!("it started") };
     assert!(why.contains("servo") || why.contains("load"), "{why}");
     assert!(world.clock().now_ns() < 20 * SECOND_NS);
+}
+
+/// A rig that has not started gives way to the package before it; one that has waited for its operator does not.
+/// Mutant tried: a refused start-up counts as started.
+#[test]
+fn a_rig_has_started_once_it_waits_for_its_operator() {
+    let mut refused = [0; 2];
+    for tenths in 0..30 {
+        let (rig, model, plant) = rigs::pair();
+        let mut world = World::new(&rig, Some(plant), Pace::Fast, 1).unwrap();
+        world.bus(0).unplug(super::simulated::BENCH, tenths * SECOND_NS / 10, u64::MAX);
+        let masters = world.masters();
+        let (mut hil, _) = Hil::new(&rig, model, world.clock(), masters, Options::default(), None).unwrap();
+        let mut waited = false;
+        while hil.ended().is_none() && world.clock().now_ns() < 20 * SECOND_NS {
+            hil.cycle();
+            waited |= hil.step() == Step::AwaitEnable;
+        }
+        assert_eq!(hil.has_started(), waited, "unplugged after {tenths} tenths of a second");
+        assert!(matches!(hil.ended(), Some(End::Refused(_))), "{:?}", hil.ended());
+        refused[usize::from(waited)] += 1;
+    }
+    assert!(refused.iter().all(|count| *count > 2), "before and after it waits: {refused:?}");
 }

@@ -1,7 +1,6 @@
 //! Messages of a rig as text.
 
 use super::counts::Counts;
-use crate::drive::Step;
 use crate::format;
 use crate::realtime::histogram::Histogram;
 use crate::safety::Cause;
@@ -72,15 +71,6 @@ pub fn cause(rig: &Rig, model: &Description, signals: &[Signal], cause: Cause, t
         }
         Cause::Energy => "more energy came back than the friction can hold: the loop is not stable".into(),
         Cause::Watchdog => "no cycle ended in time: the watchdog stopped the drives".into(),
-    }
-}
-
-/// The stage that a gauge shows.
-pub fn stage(number: u64) -> String {
-    match number {
-        102 => "quick stop".into(),
-        103 => "torque off".into(),
-        step => Step::ALL.iter().find(|known| **known as u64 == step).map_or("?".into(), Step::to_string),
     }
 }
 

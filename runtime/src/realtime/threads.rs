@@ -3,6 +3,7 @@
 //! In: wishes. Out: a set-up thread, and for each refusal its reason and remedy. Knows no bus and no model. Must be
 //! called before the first cycle, never in one.
 
+use std::fmt;
 use std::fs::{self, File};
 use std::io::{self, Write};
 
@@ -23,6 +24,13 @@ pub struct Wishes {
 impl Default for Wishes {
     fn default() -> Wishes {
         Wishes { priority: 80, core: None, memory: true, awake: true }
+    }
+}
+
+impl Wishes {
+    /// Those of the cycle of a rig: the defaults, on a core reserved for it if there is one.
+    pub fn of_cycle() -> Wishes {
+        Wishes { core: isolated_core(), ..Wishes::default() }
     }
 }
 
@@ -50,6 +58,12 @@ pub struct Refusal {
     pub reason: String,
     /// The command or setting that permits it.
     pub remedy: &'static str,
+}
+
+impl fmt::Display for Refusal {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        write!(f, "{:?}: {}; {}", self.what, self.reason, self.remedy)
+    }
 }
 
 /// A thread that has been set up. Dropping it restores priority, core and processor sleep; memory stays locked.
