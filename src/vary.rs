@@ -181,10 +181,7 @@ impl Dice {
 
 /// SplitMix64's finaliser of seed · 0x9E37… + k, as in the language's `random`.
 fn word(seed: u64, k: u64) -> u64 {
-    let mut z = seed.wrapping_mul(0x9E37_79B9_7F4A_7C15).wrapping_add(k);
-    z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
-    z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
-    z ^ (z >> 31)
+    abi::random::finalised(seed.wrapping_mul(abi::random::GAMMA).wrapping_add(k))
 }
 
 type Ratio = ([f64; 8], [f64; 8]);

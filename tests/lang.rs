@@ -242,20 +242,12 @@ fn one_mistake_gets_one_message() {
     assert_eq!(talkative, several);
 }
 
-/// SplitMix64: chance with a seed that is printed.
+/// A generator; the field is its state, at first the seed, which is printed.
 struct Chance(u64);
 
 impl Chance {
-    fn next(&mut self) -> u64 {
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let mut z = self.0;
-        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        z ^ (z >> 31)
-    }
-
     fn below(&mut self, n: usize) -> usize {
-        (self.next() % n.max(1) as u64) as usize
+        abi::random::below(&mut self.0, n)
     }
 
     fn of<'a, T>(&mut self, all: &'a [T]) -> &'a T {

@@ -4,6 +4,7 @@
 //! All numbers of a model are in one flat block of `f64`, addressed by [`Slot`]s. Every function of the model reads and
 //! writes that block and nothing else. Knows neither the language nor any solver.
 
+pub mod random;
 pub mod unit;
 pub mod foreign;
 pub mod description;

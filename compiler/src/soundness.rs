@@ -579,7 +579,7 @@ fn from_environment(name: &str, otherwise: u64) -> u64 {
 fn search(seed: u64, runs: u64) -> (Option<(u64, Text, String)>, u64) {
     let mut accepted = 0;
     for run in 0..runs {
-        let of_run = seed.wrapping_add(run.wrapping_mul(0x9E37_79B9_7F4A_7C15));
+        let of_run = seed.wrapping_add(run.wrapping_mul(abi::random::GAMMA));
         let text = Maker { random: Random(of_run), quantities: 1, lets: 0, part: false }.text();
         let (found, fits) = wrong(&text, of_run);
         accepted += u64::from(fits);

@@ -1,5 +1,8 @@
 //! The canonical form of a text.
 
+#[path = "../../abi/src/random.rs"]
+#[allow(dead_code, reason = "the generator has more")]
+mod random;
 mod samples;
 
 use grammar::format::{canonical_unit, format};
@@ -145,16 +148,12 @@ fn long_lines_are_broken_behind_a_comma() {
     );
 }
 
-/// SplitMix64: the same numbers on every machine.
+/// A generator; the field is its state, at first the seed.
 struct Chance(u64);
 
 impl Chance {
     fn below(&mut self, bound: usize) -> usize {
-        self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
-        let mut x = self.0;
-        x = (x ^ (x >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
-        x = (x ^ (x >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
-        ((x ^ (x >> 31)) % bound.max(1) as u64) as usize
+        random::below(&mut self.0, bound)
     }
 }
 

@@ -1,5 +1,8 @@
 //! What a text becomes, and what is said about a wrong one.
 
+#[path = "../../abi/src/random.rs"]
+#[allow(dead_code, reason = "the generator has more")]
+mod random;
 mod samples;
 
 use grammar::ast::*;
@@ -484,16 +487,12 @@ fn odd_texts_are_read() {
     bare("const a = 2 µm\nconst b = 3 °\nconst c = 4 kΩ\nconst d = 5 N*m\nconst e = 6 Nm\nconst f = 7 N·m");
 }
 
-/// SplitMix64: the same numbers on every machine.
+/// A generator; the field is its state, at first the seed.
 struct Chance(u64);
 
 impl Chance {
     fn below(&mut self, bound: usize) -> usize {
-        self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
-        let mut x = self.0;
-        x = (x ^ (x >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
-        x = (x ^ (x >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
-        ((x ^ (x >> 31)) % bound.max(1) as u64) as usize
+        random::below(&mut self.0, bound)
     }
 }
 
@@ -532,22 +531,5 @@ fn no_mutation_of_a_sample_is_too_much() {
         if std::panic::catch_unwind(|| read(&text)).is_err() {
             panic!("seed {seed}:\n{text}");
         }
-    }
-}
-
-/// Run by hand, with `--release --ignored --nocapture`: how long reading takes.
-#[test]
-#[ignore = "a measurement"]
-fn how_fast_is_it() {
-    let all: String = SAMPLES.iter().map(|(_, text)| *text).collect();
-    let long = all.repeat((1 << 20) / all.len());
-    for (name, text) in [("1 MB", &long), ("the samples", &all), ("LuGre", &SAMPLES[5].1.to_string())] {
-        let started = std::time::Instant::now();
-        let tokens = grammar::tokens::tokens(text).len();
-        let cut = started.elapsed();
-        let started = std::time::Instant::now();
-        assert_eq!(read(text).diagnostics, []);
-        let lines = text.lines().count();
-        println!("{name}: {lines} lines, {tokens} tokens: cut in {cut:?}, read in {:?}", started.elapsed());
     }
 }

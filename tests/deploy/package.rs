@@ -164,12 +164,9 @@ fn program(path: &Path, name: &str) -> Vec<u8> {
     package.section(name).unwrap().to_vec()
 }
 
-/// Numbers in -1 .. 1 from SplitMix64's finaliser.
+/// The number k of a sequence in -1 .. 1.
 fn chance(k: u64) -> f64 {
-    let mut x = k.wrapping_mul(0x9e37_79b9_7f4a_7c15);
-    x = (x ^ (x >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-    x = (x ^ (x >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-    ((x ^ (x >> 31)) >> 11) as f64 / (1u64 << 52) as f64 - 1.0
+    (abi::random::finalised(k.wrapping_mul(abi::random::GAMMA)) >> 11) as f64 / (1u64 << 52) as f64 - 1.0
 }
 
 /// Blocks after the functions of a program.

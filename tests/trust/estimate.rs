@@ -3,9 +3,9 @@
 //! Every experiment of the library and its tests is run by each method, at several tolerances or steps; the reference
 //! is an adaptive run at tol 1e-13. A measure counts as covered if its distance to the reference is at most three times
 //! its estimate plus the uncertainty of the reference: twice its distance to a run at tol 1e-12, and rounding. `cargo
-//! test` takes a sample of the space, chosen by a seed that is printed (`FRIC_SEED=7` takes another one); `cargo test
-//! --test trust -- --ignored --nocapture survey` takes all and prints the table of docs/numerics.md, `EVERY=6` every
-//! sixth experiment.
+//! test` takes a sample of the space, chosen by a seed that is printed (`FRIC_SEED=7` takes another one);
+//! `FRIC_SURVEY=1 cargo test --release --test trust -- --nocapture estimates_cover` takes all and prints the table of
+//! docs/numerics.md, `FRIC_SURVEY=6` every sixth experiment.
 
 use crate::chance::{Chance, seeds};
 use crate::support::{Texts, root, texts_below};
@@ -242,13 +242,11 @@ fn shown(survey: &Survey) -> String {
     out
 }
 
-#[test]
-#[ignore = "takes minutes; prints the table of docs/numerics.md"]
-fn survey_of_the_whole_library() {
-    let every: usize = std::env::var("EVERY").ok().and_then(|n| n.parse().ok()).unwrap_or(1);
+/// The survey: all subjects, or every so many.
+fn survey_of_the_whole_library(every: usize) {
     let mut tell = |missed| println!("{missed}");
     let mut survey = Survey { table: BTreeMap::new(), tell: &mut tell, steps: MOST_STEPS };
-    for subject in subjects().iter().step_by(every) {
+    for subject in subjects().iter().step_by(every.max(1)) {
         survey.take(subject, &settings());
     }
     println!("{}", shown(&survey));
@@ -258,7 +256,10 @@ fn survey_of_the_whole_library() {
 }
 
 #[test]
-fn estimates_cover_the_true_error_of_a_sample() {
+fn estimates_cover_the_true_error() {
+    if let Some(every) = std::env::var("FRIC_SURVEY").ok().and_then(|every| every.parse().ok()) {
+        return survey_of_the_whole_library(every);
+    }
     for seed in seeds(1) {
         let (mut chance, subjects) = (Chance::new(seed), subjects());
         let mut missed = String::new();

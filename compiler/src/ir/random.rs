@@ -4,24 +4,19 @@ use super::verify::result;
 use super::{Func, Op, Type, Value, Write};
 use abi::{Layout, Slot};
 
-/// The SplitMix64 generator; the field is its state. Source: Steele, Lea, Flood, *Fast splittable pseudorandom number
-/// generators*, 2014.
+/// A SplitMix64 generator; the field is its state.
 #[derive(Clone)]
 pub struct Random(pub u64);
 
 impl Random {
     /// 64 random bits.
     pub fn bits(&mut self) -> u64 {
-        self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
-        let mut z = self.0;
-        z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
-        z ^ (z >> 31)
+        abi::random::next(&mut self.0)
     }
 
     /// Uniform in 0..n (with a negligible bias).
     pub fn below(&mut self, n: usize) -> usize {
-        (self.bits() % n as u64) as usize
+        abi::random::below(&mut self.0, n)
     }
 
     /// Uniform in [lo, hi).

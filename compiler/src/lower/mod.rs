@@ -1460,7 +1460,7 @@ impl<'a> Emit<'a> {
     fn random(&mut self, seed: Value, k: Value) -> Value {
         let build = &mut self.build;
         let (seed, k) = (build.to_int(seed), build.to_int(k));
-        let golden = build.int(0x9E37_79B9_7F4A_7C15_u64 as i64);
+        let golden = build.int(abi::random::GAMMA as i64);
         let spread = build.int_mul(seed, golden);
         let mut z = build.int_add(spread, k);
         for (shift, factor) in [(30, 0xBF58_476D_1CE4_E5B9_u64), (27, 0x94D0_49BB_1331_11EB_u64)] {

@@ -253,29 +253,6 @@ mod tests {
         assert!(failure.recording.rows().len() >= 1000);
     }
 
-    /// Measures the cost of observation: `cargo test --release -p runtime -- --ignored --nocapture steps_cost`.
-    #[test]
-    #[ignore = "prints times, judges nothing"]
-    fn steps_cost_little_beyond_the_model() {
-        let instance = models::cheap();
-        let mut experiment = fixed(100.0, 1e-5);
-        let timed = |what: &str, experiment: &Experiment| {
-            let start = std::time::Instant::now();
-            let outcome = go(instance.clone(), experiment).unwrap();
-            let each = start.elapsed().as_secs_f64() / outcome.work.steps as f64;
-            println!("{what}: {:.1} ns a step, {} steps", 1e9 * each, outcome.work.steps);
-        };
-        timed("nothing", &experiment);
-        experiment.expects.push(reading(&instance, MeasureKind::Max, "x"));
-        timed("max", &experiment);
-        experiment.expects.push(reading(&instance, MeasureKind::Rms, "x"));
-        timed("max, rms", &experiment);
-        experiment.plots.push(plot(&instance, &["x", "x"]));
-        timed("max, rms, one series", &experiment);
-        experiment.plots.push(plot(&instance, &["y"]));
-        timed("max, rms, two series", &experiment);
-    }
-
     #[test]
     fn an_instant_is_a_run_of_no_steps() {
         let outcome = go(models::decay(), &fixed(0.0, 1e-3)).unwrap();

@@ -591,28 +591,3 @@ fn any_bristle_can_be_pulled() {
         assert!(reach < bound, "seed {seed}: {reach} m, beyond {bound} m");
     }
 }
-
-/// Measures the cost of a run: `cargo test --release -p runtime -- --ignored --nocapture adaptive_steps_cost`.
-#[test]
-#[ignore = "prints times, judges nothing"]
-fn adaptive_steps_cost() {
-    let instance = models::stick_slip(1e5f64.sqrt());
-    let timed = |what: &str, experiment: &Experiment| {
-        let start = std::time::Instant::now();
-        let runs = 100;
-        let mut work = String::new();
-        for _ in 0..runs {
-            let outcome = run(instance.clone(), experiment, &mut |_| Continue::Continue(())).unwrap();
-            work = outcome.work.to_string();
-        }
-        println!("{what}: {:.3} ms a run of {work}", 1e3 * start.elapsed().as_secs_f64() / f64::from(runs));
-    };
-    for tol in [1e-6, 1e-8] {
-        let mut experiment = adaptive(20.0, tol);
-        timed("nothing", &experiment);
-        experiment.plots.push(plot(&instance, &["x", "v"]));
-        timed("plot of two", &experiment);
-        experiment.expects.push(reading(&instance, MeasureKind::Max, "v"));
-        timed("plot and max", &experiment);
-    }
-}

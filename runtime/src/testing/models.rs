@@ -276,28 +276,6 @@ impl Interpret for Hand {
     }
 }
 
-/// As `decay`, with a step of four operations, so that the remaining cost is that of the engine.
-pub fn cheap() -> Instance {
-    struct Cheap(Layout);
-    impl Interpret for Cheap {
-        fn call(&self, _: Function, block: &mut [f64], _pool: &[f64], count: u64) -> u64 {
-            let (x, y) = (self.0.states.start as usize, self.0.outputs.start as usize);
-            for _ in 0..count {
-                block[Slot::COUNT.index()] += 1.0;
-                block[x] -= block[Slot::STEP.index()] * block[x];
-                block[y] = 2.0 * block[x];
-            }
-            0
-        }
-        fn has(&self, function: Function) -> bool {
-            function != Function::Transitions
-        }
-    }
-    let decay = decay();
-    let layout = decay.description().layout.clone();
-    Instance::new(decay.description().clone(), Code::Interpreted(Arc::new(Cheap(layout))), &[])
-}
-
 /// `x = a exp(−t/tau)` by its equation, with a = 1, tau = 1 s; output `y = 2 x`.
 pub fn decay() -> Instance {
     Model::new("Decay")
