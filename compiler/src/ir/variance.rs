@@ -74,7 +74,7 @@ pub fn variance(func: &Func, layout: Option<&Layout>) -> Vec<Variance> {
 pub fn of_slots(func: &Func, slots: &Slots) -> Vec<Variance> {
     propagate(
         func.ops.len(),
-        |i| own(func, slots, func.ops[i]),
+        |i| own(slots, func.ops[i]),
         |i, each| {
             func.ops[i].each_operand(|operand| each(operand.index()));
         },
@@ -87,7 +87,7 @@ pub fn of_data(func: &Func, layout: &Layout) -> Vec<Variance> {
     let slots = Slots::new(func.stores.iter().map(|(slot, _)| *slot), Some(layout));
     propagate(
         func.ops.len(),
-        |i| own(func, &slots, func.ops[i]),
+        |i| own(&slots, func.ops[i]),
         |i, each| {
             func.ops[i].each_data_operand(|operand| each(operand.index()));
         },
@@ -95,10 +95,9 @@ pub fn of_data(func: &Func, layout: &Layout) -> Vec<Variance> {
 }
 
 /// What an operation adds to the variance of its operands.
-fn own(func: &Func, slots: &Slots, op: Op) -> Variance {
+fn own(slots: &Slots, op: Op) -> Variance {
     match op {
         Op::Load(slot) => slots.of(slot),
-        Op::Ring { .. } if func.writes.is_empty() => Variance::Inputs,
         Op::Ring { .. } => Variance::Samples,
         _ => Variance::Parameters,
     }
