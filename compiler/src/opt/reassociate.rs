@@ -14,8 +14,8 @@
 //! - An expression f that is affine in a late value L is split: f(L) → f(0) + C L, where C is invariant or depends on
 //!   time alone: v + h (u − (σ0 z + σ1 (w − L)))/m → [v + h (u − (σ0 z + σ1 w))/m] + (h σ1/m) L.
 //!
-//! Sources: Briggs, Cooper, *Effective Partial Redundancy Elimination*, 1994 (reassociation by rank); Golumbic,
-//! *Combinatorial Merging*, 1976 (operands that are ready first are combined first).
+//! Sources: Briggs, Cooper, *Effective Partial Redundancy Elimination*, 1994 (reassociation by rank); Parker,
+//! *Combinatorial Merging and Huffman's Algorithm*, 1979 (operands that are ready first are combined first).
 
 use crate::ir::build::Build;
 use crate::ir::{Binary, Func, Op, Unary, Value};

@@ -8,8 +8,9 @@
 //! short steps.
 //!
 //! All observer poles are at θ per period: x̂, ŵ and d̂ are corrected by 1 − θ³, 1.5 (1 − θ)² (1 + θ)/T and (1 − θ)³
-//! J/T² times the error of the position (Kalata, "The tracking index: a generalized parameter for α-β and α-β-γ target
-//! trackers", IEEE Trans. Aerospace and Electronic Systems, 1984, with equal poles).
+//! J/T² times the error of the position: an α-β-γ filter (Kalata, *The Tracking Index*, IEEE Trans. Aerospace and
+//! Electronic Systems, 1984) with equal poles (Brookner, *Tracking and Kalman Filtering Made Easy*, 1998: critically
+//! damped g-h-k filter).
 
 use crate::coupling::lag::Lag;
 use abi::Instance;
