@@ -5,6 +5,7 @@
 
 mod support;
 
+use compiler::functions::Builtin;
 use runtime::engine::{Failure, Outcome};
 use std::collections::BTreeSet;
 use std::fs;
@@ -198,4 +199,36 @@ fn every_code_has_a_page_and_every_page_a_code() {
     assert!(idle.is_empty(), "pages of codes that nothing gives: {idle:?}");
     let came: Vec<_> = listed.intersection(&given).collect();
     assert!(came.is_empty(), "given by now, take them off the list and write their examples: {came:?}");
+}
+
+/// The tables of functions in the manual and in the compiler list the same functions, with the same arguments.
+#[test]
+fn the_manual_lists_every_function() {
+    let page = fs::read_to_string(root().join("docs/language.md")).unwrap();
+    let rows = ["numbers", "near 0", "signals", "past", "random numbers"].map(|kind| {
+        let row = page.lines().find(|line| line.starts_with(&format!("| {kind} |")));
+        row.unwrap_or_else(|| panic!("no row `{kind}`"))
+    });
+    // Calls and names in code, split at blanks outside parentheses.
+    let mut listed: Vec<String> = Vec::new();
+    for code in rows.iter().flat_map(|row| row.split('`').skip(1).step_by(2)) {
+        let mut open = 0;
+        let parts = code.split(|c: char| {
+            open += i32::from(c == '(') - i32::from(c == ')');
+            c == ' ' && open == 0
+        });
+        listed.extend(parts.map(str::to_string));
+    }
+    let mut known = BTreeSet::new();
+    for call in &listed {
+        let name = call.split('(').next().unwrap();
+        let builtin = Builtin::named(name).unwrap_or_else(|| panic!("`{call}` is no function"));
+        known.insert(name);
+        let example = call.ends_with("(0)");
+        if call.contains('(') && !example {
+            assert_eq!(*call, builtin.signature().to_string());
+        }
+    }
+    let missing: Vec<&str> = Builtin::all().map(Builtin::name).filter(|name| !known.contains(name)).collect();
+    assert!(missing.is_empty(), "not in the manual: {missing:?}");
 }

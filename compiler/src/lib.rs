@@ -8,6 +8,9 @@
 
 #![cfg_attr(test, allow(clippy::disallowed_methods, reason = "tests compare with the platform's functions"))]
 
+pub mod interval;
+pub mod functions;
+
 pub mod ir;
 pub mod math;
 pub mod opt;

@@ -7,8 +7,9 @@
 //! results too large for a double, and instants at which a guarded range is left. `FRIC_SEED` sets the seed,
 //! `FRIC_RUNS` the number of texts (default 600).
 
+use crate::functions::{Binary, Builtin, Domain, Shape, Unary};
+use crate::interval::{Interval, planted};
 use crate::ir::random::Random;
-use crate::ranges::interval::planted;
 use crate::ranges::reach::HUGE;
 use abi::description::TINY;
 use std::fmt::Write;
@@ -135,6 +136,15 @@ struct Maker {
     part: bool,
 }
 
+/// Names of the functions of one argument that have a domain, or that have none.
+fn of_one_argument(has_domain: bool) -> Vec<&'static str> {
+    let fits = |builtin: &Builtin| {
+        let domain = builtin.domain().map_or(Domain::ALL, |(_, domain)| domain);
+        builtin.signature().arguments.len() == 1 && has_domain == (domain != Domain::ALL)
+    };
+    Builtin::all().filter(fits).map(Builtin::name).collect()
+}
+
 const NUMBERS: &[f64] = &[0.0, 1.0, 2.0, 3.0, 0.5, 1.7, 1e-3, 1e3, 1e-17, 40.0];
 
 impl Maker {
@@ -198,11 +208,8 @@ impl Maker {
             6 => E::Negate(self.expr(d)),
             7 => E::Power(self.expr(d), self.pick(&[2.0, 3.0, -1.0, -2.0, -3.0, 0.5, -0.5, 7.0, -20.0])),
             8 => E::Raised(self.expr(d), self.leaf()),
-            9 => E::Call(self.pick(&["sqrt", "log", "asin", "acos", "log1p"]), vec![self.expr(d)]),
-            10 | 11 => E::Call(
-                self.pick(&["abs", "sign", "floor", "exp", "expm1", "sin", "tanh", "atan", "cosh", "sinh"]),
-                vec![self.expr(d)],
-            ),
+            9 => E::Call(self.pick(&of_one_argument(true)), vec![self.expr(d)]),
+            10 | 11 => E::Call(self.pick(&of_one_argument(false)), vec![self.expr(d)]),
             12 => E::Call(self.pick(&["min", "max", "hypot"]), vec![self.expr(d), self.expr(d)]),
             13 => E::Op('+', Rc::new(E::Number(1.0)), Rc::new(E::Power(self.expr(d), 2.0))),
             14 => E::Call("exp", vec![Rc::new(E::Negate(Rc::new(E::Power(self.leaf(), 2.0))))]),
@@ -340,25 +347,22 @@ impl Values<'_> {
                 let x = args[0];
                 let (value, bad) = match *f {
                     "sqrt" => (x.sqrt(), x < 0.0),
-                    "log" => (x.ln(), x <= 0.0),
-                    "log1p" => (x.ln_1p(), x <= -1.0),
-                    "asin" => (x.asin(), x.abs() > 1.0),
-                    "acos" => (x.acos(), x.abs() > 1.0),
                     "abs" => (x.abs(), false),
                     "sign" => (if x == 0.0 { 0.0 } else { x.signum() }, false),
                     "floor" => (x.floor(), false),
-                    "exp" => (x.exp(), false),
-                    "expm1" => (x.exp_m1(), false),
-                    // The compiler's sine is 0 beyond 1e12.
-                    "sin" => (if x.abs() > 1e12 { 0.0 } else { x.sin() }, false),
-                    "tanh" => (x.tanh(), false),
-                    "atan" => (x.atan(), false),
-                    "cosh" => (x.cosh(), false),
-                    "sinh" => (x.sinh(), false),
                     "min" => (x.min(args[1]), false),
                     "max" => (x.max(args[1]), false),
                     "hypot" => (x.hypot(args[1]), false),
-                    other => unreachable!("{other}"),
+                    name => {
+                        let Some(Builtin::Unary(function)) = Builtin::named(name) else { unreachable!("{name}") };
+                        let value = match function {
+                            // The compiler's are those of 0 there.
+                            Unary::Sin | Unary::Cos | Unary::Tan if x.abs() > 1e12 => (function.row().value)(0.0),
+                            _ => (function.row().value)(x),
+                        };
+                        // Outside its domain a function is not a number; at its ends it may be infinite.
+                        (value, value.is_nan() || value.is_infinite() && x.abs() <= 1.0)
+                    }
                 };
                 self.judged(value, || format!("{f}({x:e})"), bad)
             }
@@ -593,7 +597,7 @@ fn search(seed: u64, runs: u64) -> (Option<(u64, Text, String)>, u64) {
 
 #[test]
 fn accepted_texts_yield_finite_outputs() {
-    let (seed, runs) = (from_environment("FRIC_SEED", 23), from_environment("FRIC_RUNS", 600));
+    let (seed, runs) = (from_environment("FRIC_SEED", 1), from_environment("FRIC_RUNS", 600));
     let (found, accepted) = search(seed, runs);
     if let Some((run, text, message)) = found {
         panic!("seed {seed}, text {run}: {message}\n{}", text.show());
@@ -604,7 +608,7 @@ fn accepted_texts_yield_finite_outputs() {
 
 #[test]
 fn injected_faults_are_detected() {
-    let seed = from_environment("FRIC_SEED", 23);
+    let seed = from_environment("FRIC_SEED", 1);
     let mut missed = Vec::new();
     for name in planted::ALL.iter().filter(|name| **name != "ends do not round") {
         planted::plant(name);
@@ -618,48 +622,69 @@ fn injected_faults_are_detected() {
     assert!(missed.is_empty(), "seed {seed}: not found: {missed:?}");
 }
 
-/// The compiler's elementary functions stay within the limits that proofs rely on, to the last bit.
+/// The compiler's elementary functions lie in their images by interval arithmetic, on which proofs rely, to the last
+/// bit.
 #[test]
-fn elementary_functions_stay_within_their_limits() {
-    use crate::ir::build::Build;
-    use crate::ir::{Binary, Unary};
-    use abi::Slot;
-    let unary = [Unary::Exp, Unary::Tanh, Unary::Sin, Unary::Cos, Unary::Cosh, Unary::Expm1, Unary::Atan, Unary::Sinh];
-    let mut build = Build::new("limits").with_pool(crate::math::POOL.as_slice().into());
-    let (x, n) = (build.load(Slot(0)), build.load(Slot(1)));
-    for (k, function) in unary.into_iter().enumerate() {
-        let y = build.unary(function, x);
-        build.store(Slot(2 + k as u32), y);
+fn elementary_functions_lie_in_their_images() {
+    in_their_images();
+}
+
+#[test]
+fn wrong_limits_of_elementary_functions_are_detected() {
+    for fault in ["exponentials are never zero", "tanh never reaches 1"] {
+        planted::plant(fault);
+        let found = std::panic::catch_unwind(in_their_images);
+        planted::plant("");
+        assert!(found.is_err(), "{fault}");
     }
-    let power = build.binary(Binary::Pow, x, n);
-    build.store(Slot(10), power);
+}
+
+fn in_their_images() {
+    use crate::ir::build::Build;
+    use abi::Slot;
+    let mut build = Build::new("images").with_pool(crate::math::POOL.as_slice().into());
+    let (x, y) = (build.load(Slot(0)), build.load(Slot(1)));
+    let of_one = Unary::ALL.map(|function| build.unary(function, x));
+    let of_two = Binary::ALL.map(|function| build.binary(function, x, y));
+    for (k, value) in of_one.into_iter().chain(of_two).enumerate() {
+        build.store(Slot(2 + k as u32), value);
+    }
     let func = crate::math::expand(&build.finish());
-    let mut random = Random(7);
-    for _ in 0..20_000 {
-        let x = match random.below(3) {
-            0 => random.within(-1.0, 1.0) * [1e-300, 1e-17, 1e-16, 1e-8, 1e-3][random.below(5)],
-            1 => random.within(-40.0, 40.0),
+    let seed = from_environment("FRIC_SEED", 7);
+    let mut random = Random(seed);
+    for case in 0..20_000 {
+        let mut number = || match random.below(3) {
+            0 => random.within(-1.0, 1.0) * [1e-300, 1e-17, 1e-16, 1e-8, 1e-3, 1.0][random.below(6)],
+            1 => random.within(-750.0, 750.0) * [1.0, 0.05, 0.004][random.below(3)],
             _ => random.real(),
         };
-        if x.is_nan() {
+        let (x, y, ends) = (number(), number(), [number(), number()]);
+        if x.is_nan() || y.is_nan() {
             continue;
         }
-        let n = random.within(0.0, 3.0);
-        let mut block = [0.0; 11];
-        (block[0], block[1]) = (x, n);
+        let mut block = [0.0; 2 + Unary::ALL.len() + Binary::ALL.len()];
+        (block[0], block[1]) = (x, y);
         crate::ir::interpret::run_once(&func, &mut block, crate::math::pool());
-        let [exp, tanh, sin, cos, cosh, expm1, atan, sinh, power] = block[2..] else { unreachable!() };
-        assert!(if x <= 0.0 { (0.0..=1.0).contains(&exp) } else { exp >= 1.0 }, "exp({x:e}) = {exp:e}");
-        assert!(tanh.abs() <= 1.0, "tanh({x:e}) = {tanh:e}");
-        if x.is_finite() {
-            assert!(sin.abs() <= 1.0 && cos.abs() <= 1.0, "sin, cos({x:e}) = {sin:e}, {cos:e}");
-        }
-        assert!(cosh >= 1.0 && expm1 >= -1.0, "cosh, expm1({x:e}) = {cosh:e}, {expm1:e}");
-        for y in [tanh, expm1, atan, sinh] {
-            assert!(y * x.signum() >= 0.0, "{y:e} at {x:e}");
-        }
-        if (0.0..=1.0).contains(&x) {
-            assert!((0.0..=1.0).contains(&power), "{x:e}^{n} = {power:e}");
+        let check = |name: &str, image: Interval, value: f64, x: Interval, y: Interval| {
+            let inside = value >= image.low && value <= image.high && value.abs() >= image.away;
+            assert!(inside, "seed {seed}, case {case}: {name} of {x:?}, {y:?}: {value:e} in {image:?}");
+        };
+        // The images of the numbers alone, and of intervals that hold them.
+        let [wide_x, wide_y] =
+            [(x, ends[0]), (y, ends[1])].map(|(x, end)| Interval::point(x).hull(Interval::closed(end, end)));
+        for (at_x, at_y) in [(Interval::point(x), Interval::point(y)), (wide_x, wide_y)] {
+            for (k, function) in Unary::ALL.into_iter().enumerate() {
+                let row = function.row();
+                if row.domain.holds(Interval::point(x)) && (x.is_finite() || row.shape != Shape::Other) {
+                    check(row.name, function.image(at_x), block[2 + k], at_x, at_y);
+                }
+            }
+            for (k, function) in Binary::ALL.into_iter().enumerate() {
+                let value = block[2 + Unary::ALL.len() + k];
+                if !value.is_nan() {
+                    check(function.name(), (function.row().image)(at_x, at_y), value, at_x, at_y);
+                }
+            }
         }
     }
 }

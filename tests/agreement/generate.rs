@@ -4,6 +4,8 @@
 //! Each expression is generated for a unit, from names in scope: earlier declarations only, so that there are no
 //! cycles. Numbers are often edge cases: zeros, subnormals, overflow.
 
+use abi::plan::Method;
+use compiler::functions::{Domain, Unary};
 use compiler::ir::random::Random;
 
 /// Exponents of kg, m and s.
@@ -315,16 +317,17 @@ impl Writer {
     fn number(&mut self, scope: &Scope, depth: usize) -> String {
         let x = |writer: &mut Writer| writer.real(scope, NUMBER, depth);
         match self.below(18) {
-            0 | 1 => format!("exp({})", x(self)),
-            2 => format!("exp(-{}^2)", x(self)),
-            3 => format!("log(abs({}))", x(self)),
-            4 => format!("sin({})", x(self)),
-            5 => format!("cos({})", x(self)),
-            6 => format!("tan({})", x(self)),
-            7 => format!("asin(clamp({}, -1, 1))", x(self)),
-            8 => format!("acos(clamp({}, -1, 1))", x(self)),
-            9 => format!("atan({})", x(self)),
-            10 | 11 => format!("tanh({})", x(self)),
+            0 => format!("exp(-{}^2)", x(self)),
+            1..=11 => {
+                let function = Unary::ALL[self.below(Unary::ALL.len())];
+                let Domain { low, high, .. } = function.row().domain;
+                let x = x(self);
+                match (low.is_finite(), high.is_finite()) {
+                    (_, true) => format!("{}(clamp({x}, {low}, {high}))", function.name()),
+                    (true, false) => format!("{}(abs({x}) + {low})", function.name()),
+                    (false, false) => format!("{}({x})", function.name()),
+                }
+            }
             12 => format!("floor({})", x(self)),
             13 => format!("(abs({})^{})", x(self), ["2", "3", "0.5", "1.7", "-1"][self.below(5)]),
             14 => format!("(abs({})^{})", x(self), x(self)),

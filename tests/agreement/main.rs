@@ -22,6 +22,7 @@ use abi::Function;
 use abi::plan::Method;
 use campaign::{Campaign, Kind, Made};
 use case::{Case, Run, of_chance};
+use compiler::functions::{Binary, Unary};
 use compiler::ir::random::{self, Random};
 use compiler::ir::{Func, Op, Value};
 use report::Distribution;
@@ -126,7 +127,8 @@ fn seeds_of_the_grammar_agree() {
         let with = seen.count(&format!("with/{what}"));
         assert!(with * 50 >= programs, "{what} in {with} of {programs} programs");
     }
-    assert!(seen.group("elementary").len() >= 13, "every elementary function");
+    // All of them, and the square root.
+    assert_eq!(seen.group("elementary").len(), Unary::ALL.len() + Binary::ALL.len() + 1, "every elementary function");
     for (width, with) in seen.group("lanes") {
         assert!(with * 5 >= programs, "{with} of {programs} programs have lanes of {width}");
     }

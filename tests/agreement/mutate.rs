@@ -5,6 +5,7 @@
 use crate::campaign::Made;
 use crate::texts::{self, FIXED, Fallen};
 use abi::plan::Method;
+use compiler::functions::{Builtin, Units};
 use compiler::ir::program::Program;
 use compiler::ir::random::Random;
 use grammar::ast::{
@@ -219,8 +220,8 @@ impl Original {
                 (place.span, other.into(), "name")
             }
             What::Call(function, at) => {
-                let alike = FUNCTIONS.iter().find(|alike| alike.contains(&function.as_str()));
-                let other = alike.map_or(function.as_str(), |alike| alike[random.below(alike.len())]);
+                let alike = alike(function);
+                let other = if alike.is_empty() { function.as_str() } else { alike[random.below(alike.len())] };
                 (*at, other.into(), "function")
             }
             What::Binary(op, at, left, right) => {
@@ -258,15 +259,24 @@ const EDGES: [&str; 14] = [
     "709.9",
 ];
 
-/// Functions with the same units of arguments and results, as far as possible.
-const FUNCTIONS: [&[&str]; 6] = [
-    &["exp", "sin", "cos", "tan", "tanh", "atan", "log", "floor"],
-    &["asin", "acos", "atan"],
-    &["min", "max", "hypot"],
-    &["abs", "sign", "sqrt"],
-    &["sine", "square"],
-    &["sum", "min", "max"],
-];
+/// The functions that may replace a function: with as many arguments of the same units, and folds for a fold. `sign` and
+/// `sqrt` also replace `abs`, although their results have other units.
+fn alike(function: &str) -> Vec<&'static str> {
+    match (function, Builtin::named(function)) {
+        ("sum", _) => vec!["sum", "min", "max"],
+        ("abs" | "sign" | "sqrt", _) => vec!["abs", "sign", "sqrt"],
+        (_, Some(builtin)) => {
+            let units = |builtin: Builtin| {
+                let signature = builtin.signature();
+                let arguments: Vec<Units> = signature.arguments.iter().map(|(_, units)| *units).collect();
+                (arguments, signature.result)
+            };
+            let wanted = units(builtin);
+            Builtin::all().filter(|other| units(*other) == wanted).map(Builtin::name).collect()
+        }
+        (_, None) => Vec::new(),
+    }
+}
 
 fn sums(op: BinaryOp) -> bool {
     matches!(op, BinaryOp::Add | BinaryOp::Subtract)

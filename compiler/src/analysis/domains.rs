@@ -6,7 +6,8 @@
 use crate::frontend::source::Files;
 use crate::frontend::system::*;
 use crate::frontend::units::Types;
-use crate::ranges::interval::planted;
+use crate::functions::{Domain, Unary};
+use crate::interval::planted;
 use crate::ranges::reach::{Reach, whole};
 use grammar::ast::BinaryOp;
 use grammar::diagnostic::Diagnostic;
@@ -157,9 +158,10 @@ impl Visit {
         }
         let judged = match system.node(id) {
             Node::Binary(BinaryOp::Divide, _, x) | Node::Binary(BinaryOp::Power, x, _) => Some(*x),
-            Node::Call(Builtin::Chirp, args) => Some(args[3]),
-            Node::Call(Builtin::Noise, args) => Some(args[1]),
-            Node::Call(_, args) => args.first().copied(),
+            Node::Call(builtin, args) => {
+                let judged = builtin.domain().map_or(0, |(argument, _)| argument);
+                args.get(judged).copied()
+            }
             _ => None,
         };
         if self.constants && !judged.is_some_and(|x| reach.interval(x).is_point()) {
@@ -170,30 +172,11 @@ impl Visit {
                 found.push(division(reach, types, files, *b));
             }
             Node::Binary(BinaryOp::Power, a, b) => self.power(reach, *a, *b, types, files, found),
-            Node::Call(Builtin::Sqrt, args) if !reach.interval(args[0]).is_not_negative() => {
-                found.push(domain(reach, files, args[0], "`sqrt`", "negative", ">= 0", "abs"));
-            }
-            Node::Call(Builtin::Log, args) if !reach.interval(args[0]).is_positive() => {
-                found.push(domain(reach, files, args[0], "`log`", "zero or negative", "> 0", "max"));
-            }
-            Node::Call(Builtin::Log1p, args) => {
-                let x = reach.interval(args[0]);
-                if x.low <= -1.0 && !x.is_empty() {
-                    found.push(domain(reach, files, args[0], "`log1p`", "-1 or less", "> -1", "max"));
-                }
-            }
-            // The sweep time of a chirp, and the time for which noise keeps a value.
-            Node::Call(Builtin::Chirp, args) if !reach.interval(args[3]).is_positive() => {
-                found.push(domain(reach, files, args[3], "`chirp`", "zero or negative", "> 0", "max"));
-            }
-            Node::Call(Builtin::Noise, args) if !reach.interval(args[1]).is_positive() => {
-                found.push(domain(reach, files, args[1], "`noise`", "zero or negative", "> 0", "max"));
-            }
-            Node::Call(arc @ (Builtin::Asin | Builtin::Acos), args) => {
-                let x = reach.interval(args[0]);
-                if (x.low < -1.0 || x.high > 1.0) && !x.is_empty() {
-                    let arc = format!("`{}`", arc.name());
-                    found.push(domain(reach, files, args[0], &arc, "beyond -1 .. 1", "-1 .. 1", "clamp"));
+            Node::Call(builtin, args) => {
+                if let Some((k, domain)) = builtin.domain()
+                    && !domain.holds(reach.interval(args[k]))
+                {
+                    found.push(outside(reach, files, args[k], &format!("`{}`", builtin.name()), domain));
                 }
             }
             _ => {}
@@ -235,23 +218,28 @@ impl Visit {
                     });
                 }
             }
-            _ => found.push(domain(reach, files, a, "a power", "negative", "0", "abs")),
+            _ => found.push(outside(reach, files, a, "a power with this exponent", Domain::NOT_NEGATIVE)),
         }
     }
 }
 
-fn domain(reach: &Reach, files: &Files, id: ExprId, what: &str, can_be: &str, range: &str, guard: &str) -> Diagnostic {
+/// E0602: an argument that can leave the domain of `what`.
+fn outside(reach: &Reach, files: &Files, id: ExprId, what: &str, domain: Domain) -> Diagnostic {
     let text = files.slice(reach.system().span(id));
-    let shown = match guard {
-        "clamp" => format!("clamp({text}, -1, 1)"),
-        "max" => format!("max({text}, …)"),
-        other => format!("{other}({text})"),
+    let Domain { low, strict, high } = domain;
+    let (can_be, range, guard) = match (low, strict) {
+        _ if high.is_finite() => {
+            (format!("beyond {low} .. {high}"), format!("{low} .. {high}"), format!("clamp({text}, {low}, {high})"))
+        }
+        (0.0, false) => ("negative".into(), ">= 0".into(), format!("abs({text})")),
+        (0.0, true) => ("zero or negative".into(), "> 0".into(), format!("max({text}, …)")),
+        (_, true) => (format!("{low} or less"), format!("> {low}"), format!("max({text}, …)")),
+        (_, false) => (format!("less than {low}"), format!(">= {low}"), format!("max({text}, {low})")),
     };
-    // A power of a negative number is real only if the exponent is whole.
-    let (what, range) = if range == "0" { ("a power with this exponent", ">= 0") } else { (what, range) };
+    let proven = if high.is_finite() { format!("within {range}") } else { range.clone() };
     Diagnostic::error("E0602", format!("`{text}` can be {can_be}, where {what} is not defined"))
-        .label(reach.system().span(id), format!("not proven to be {}", range.replace("-1 .. 1", "within -1 .. 1")))
-        .help(format!("declare a range of what it is made of, so that it is `in {range}`, or guard it: `{shown}`"))
+        .label(reach.system().span(id), format!("not proven to be {proven}"))
+        .help(format!("declare a range of what it is made of, so that it is `in {range}`, or guard it: `{guard}`"))
 }
 
 /// `param Fc [N] = 1 N`: a declaration as written, without the text after its value.
@@ -350,7 +338,7 @@ fn vanishing(system: &System, id: VarId) -> Option<String> {
             Node::Var(var) if inside && system.var(*var).kind == VarKind::Input => {
                 return Some(system.var(*var).name.clone());
             }
-            Node::Call(Builtin::Exp, args) => stack.push((args[0], true)),
+            Node::Call(Builtin::Unary(Unary::Exp), args) => stack.push((args[0], true)),
             node => stack.extend(node.operands().map(|operand| (operand, inside))),
         }
     }

@@ -1257,11 +1257,10 @@ impl Reader<'_> {
             }
             Node::Call(Builtin::Abs, args) => Some(Formula::Abs(Box::new(self.formula(args[0], measures)?))),
             Node::Call(Builtin::Sqrt, args) => Some(Formula::Sqrt(Box::new(self.formula(args[0], measures)?))),
-            Node::Call(builtin, args) if elementary(builtin).is_some() => {
-                let (name, function) = elementary(builtin)?;
+            Node::Call(Builtin::Unary(function), args) => {
                 let alone = Alone::unary(function);
-                let at = Arc::new(move |x: f64, _: f64| alone.at(x));
-                Some(Formula::Function(plan::Elementary { name, at }, vec![self.formula(args[0], measures)?]))
+                let function = plan::Elementary { name: function.name(), at: Arc::new(move |x, _| alone.at(x)) };
+                Some(Formula::Function(function, vec![self.formula(args[0], measures)?]))
             }
             Node::Call(Builtin::Min, args) => pair(self, args[0], args[1], measures).map(|(a, b)| Formula::Min(a, b)),
             Node::Call(Builtin::Max, args) => pair(self, args[0], args[1], measures).map(|(a, b)| Formula::Max(a, b)),
@@ -1440,26 +1439,6 @@ pub fn depends(system: &System, expr: ExprId, of: &dyn Fn(&Var) -> bool) -> bool
         stack.extend(system.node(id).operands());
     }
     false
-}
-
-/// The elementary function of one argument that implements a built-in function, with its name.
-fn elementary(builtin: Builtin) -> Option<(&'static str, Unary)> {
-    Some(match builtin {
-        Builtin::Exp => ("exp", Unary::Exp),
-        Builtin::Expm1 => ("expm1", Unary::Expm1),
-        Builtin::Log => ("log", Unary::Log),
-        Builtin::Log1p => ("log1p", Unary::Log1p),
-        Builtin::Sin => ("sin", Unary::Sin),
-        Builtin::Cos => ("cos", Unary::Cos),
-        Builtin::Tan => ("tan", Unary::Tan),
-        Builtin::Asin => ("asin", Unary::Asin),
-        Builtin::Acos => ("acos", Unary::Acos),
-        Builtin::Atan => ("atan", Unary::Atan),
-        Builtin::Sinh => ("sinh", Unary::Sinh),
-        Builtin::Cosh => ("cosh", Unary::Cosh),
-        Builtin::Tanh => ("tanh", Unary::Tanh),
-        _ => return None,
-    })
 }
 
 fn compare(op: BinaryOp, a: Formula, b: Formula) -> Formula {

@@ -4,6 +4,7 @@
 //! operands precede their users, so most passes are a single walk over it. Function calls are expanded in place with
 //! shared nodes for their arguments, so nothing is computed twice. Knows nothing of text or of programs.
 
+pub use crate::functions::Builtin;
 use abi::unit::{Angle, Dimension, Unit};
 use grammar::ast::BinaryOp;
 use grammar::span::Span;
@@ -287,95 +288,6 @@ pub enum Role {
         /// The function or constant.
         function: String,
     },
-}
-
-/// Built-in functions and signals.
-#[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
-#[allow(missing_docs)]
-pub enum Builtin {
-    Abs,
-    Sign,
-    Min,
-    Max,
-    Clamp,
-    Floor,
-    Sqrt,
-    Exp,
-    Expm1,
-    Log,
-    Log1p,
-    Sin,
-    Cos,
-    Tan,
-    Asin,
-    Acos,
-    Atan,
-    Atan2,
-    Sinh,
-    Cosh,
-    Tanh,
-    Hypot,
-    Random,
-    Step,
-    Ramp,
-    Pulse,
-    Sine,
-    Square,
-    Chirp,
-    Noise,
-    Delay,
-}
-
-/// Name, function, number of arguments.
-const BUILTINS: &[(&str, Builtin, usize)] = &[
-    ("abs", Builtin::Abs, 1),
-    ("sign", Builtin::Sign, 1),
-    ("min", Builtin::Min, 2),
-    ("max", Builtin::Max, 2),
-    ("clamp", Builtin::Clamp, 3),
-    ("floor", Builtin::Floor, 1),
-    ("sqrt", Builtin::Sqrt, 1),
-    ("exp", Builtin::Exp, 1),
-    ("expm1", Builtin::Expm1, 1),
-    ("log", Builtin::Log, 1),
-    ("log1p", Builtin::Log1p, 1),
-    ("sin", Builtin::Sin, 1),
-    ("cos", Builtin::Cos, 1),
-    ("tan", Builtin::Tan, 1),
-    ("asin", Builtin::Asin, 1),
-    ("acos", Builtin::Acos, 1),
-    ("atan", Builtin::Atan, 1),
-    ("atan2", Builtin::Atan2, 2),
-    ("sinh", Builtin::Sinh, 1),
-    ("cosh", Builtin::Cosh, 1),
-    ("tanh", Builtin::Tanh, 1),
-    ("hypot", Builtin::Hypot, 2),
-    ("random", Builtin::Random, 2),
-    ("step", Builtin::Step, 2),
-    ("ramp", Builtin::Ramp, 3),
-    ("pulse", Builtin::Pulse, 3),
-    ("sine", Builtin::Sine, 2),
-    ("square", Builtin::Square, 2),
-    ("chirp", Builtin::Chirp, 4),
-    ("noise", Builtin::Noise, 3),
-    ("delay", Builtin::Delay, 2),
-];
-
-impl Builtin {
-    /// The function of this name and its number of arguments.
-    pub fn named(name: &str) -> Option<(Builtin, usize)> {
-        BUILTINS.iter().find(|(known, ..)| *known == name).map(|(_, builtin, args)| (*builtin, *args))
-    }
-
-    /// The name of the function.
-    pub fn name(self) -> &'static str {
-        BUILTINS.iter().find(|(_, builtin, _)| *builtin == self).expect("every built-in is listed").0
-    }
-
-    /// All names, for suggestions.
-    pub fn names() -> impl Iterator<Item = &'static str> {
-        BUILTINS.iter().map(|(name, ..)| *name)
-    }
 }
 
 /// Measures in expectations.

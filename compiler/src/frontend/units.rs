@@ -6,6 +6,7 @@
 
 use crate::frontend::source::Files;
 use crate::frontend::system::*;
+use crate::functions::Units;
 pub use abi::unit::three_digits;
 use abi::unit::{Angle, Dimension, Ratio, Unit};
 use grammar::ast::BinaryOp;
@@ -627,108 +628,75 @@ impl Checker<'_> {
         self.system.literal(id)
     }
 
+    /// Checks the arguments of a call against the units in the function's signature.
     fn call(&mut self, builtin: Builtin, args: &[ExprId]) -> Kind {
-        let none = Term::known(Dimension::NONE);
-        let (time, rate) = (Term::known(TIME), Term::known(RATE));
         let terms: Option<Vec<Term>> = {
             let all: Vec<Option<Term>> = args.iter().map(|arg| self.real(*arg)).collect();
             all.into_iter().collect()
         };
         let Some(terms) = terms else { return Kind::Unknown };
-        let need = |checker: &mut Self, k: usize, wanted: &Term| {
-            if !checker.unify(&terms[k], wanted) {
-                checker.mismatch(args[k], &terms[k], wanted);
-            }
-        };
-        match builtin {
-            Builtin::Abs => Kind::Real(terms[0].clone()),
-            Builtin::Floor => {
-                if !self.unify(&terms[0], &none) {
-                    // Rounding a quantity requires a unit to round to; the SI unit would be a guess.
-                    let (unit, text) = (self.shown(&terms[0]), self.text(args[0]));
-                    let message = format!("`floor` needs a pure number, not {}", self.described(&terms[0]));
-                    let error = Diagnostic::error("E0104", message)
-                        .label(self.system.span(args[0]), format!("whole numbers of {unit}, or of what?"))
-                        .help(format!("say of what: `(1 {unit}) * floor({text} / (1 {unit}))`"));
-                    self.diagnostics.push(error);
+        let signature = builtin.signature();
+        let of =
+            |units: Units| signature.arguments.iter().zip(args).zip(&terms).filter(move |((a, _), _)| a.1 == units);
+        // Arguments of the same unit.
+        let mut alike = of(Units::Same).map(|((_, arg), term)| (*arg, term));
+        let first = alike.next();
+        if let Some((first, x)) = first {
+            for (other, y) in alike {
+                if !self.unify(x, y) {
+                    let message =
+                        format!("`{}` compares {} with {}", builtin.name(), self.described(x), self.described(y));
+                    self.differ("E0101", message, first, x, other, y);
                     return Kind::Unknown;
                 }
-                Kind::Real(none)
-            }
-            Builtin::Sign => Kind::Real(none),
-            Builtin::Sqrt => Kind::Real(none.times(&terms[0], Ratio::new(1, 2))),
-            Builtin::Min | Builtin::Max | Builtin::Hypot | Builtin::Clamp | Builtin::Atan2 => {
-                for k in 1..args.len() {
-                    if !self.unify(&terms[0], &terms[k]) {
-                        let (x, y) = (self.described(&terms[0]), self.described(&terms[k]));
-                        let message = format!("`{}` compares {x} with {y}", builtin.name());
-                        self.differ("E0101", message, args[0], &terms[0], args[k], &terms[k]);
-                        return Kind::Unknown;
-                    }
-                }
-                let fitting = terms.iter().find(|term| term.unknowns.is_empty()).unwrap_or(&terms[0]);
-                Kind::Real(if builtin == Builtin::Atan2 { none } else { fitting.clone() })
-            }
-            Builtin::Exp
-            | Builtin::Expm1
-            | Builtin::Log
-            | Builtin::Log1p
-            | Builtin::Sin
-            | Builtin::Cos
-            | Builtin::Tan
-            | Builtin::Asin
-            | Builtin::Acos
-            | Builtin::Atan
-            | Builtin::Sinh
-            | Builtin::Cosh
-            | Builtin::Tanh
-            | Builtin::Random => {
-                for (arg, term) in args.iter().zip(&terms) {
-                    if !self.unify(term, &none) {
-                        let message = format!("`{}` needs a pure number, not {}", builtin.name(), self.described(term));
-                        let unit = self.shown(term);
-                        let error = Diagnostic::error("E0104", message)
-                            .label(self.system.span(*arg), unit.clone())
-                            .help(format!("divide by a quantity of the same kind: `{} / 1 {unit}`", self.text(*arg)));
-                        self.diagnostics.push(error);
-                    }
-                }
-                Kind::Real(none)
-            }
-            Builtin::Delay => {
-                need(self, 1, &time);
-                Kind::Real(terms[0].clone())
-            }
-            Builtin::Step => {
-                need(self, 0, &time);
-                Kind::Real(terms[1].clone())
-            }
-            Builtin::Ramp => {
-                need(self, 0, &time);
-                need(self, 2, &terms[1].times(&rate, Ratio::ONE));
-                Kind::Real(terms[1].clone())
-            }
-            Builtin::Pulse => {
-                need(self, 0, &time);
-                need(self, 1, &time);
-                Kind::Real(terms[2].clone())
-            }
-            Builtin::Sine | Builtin::Square => {
-                need(self, 1, &rate);
-                Kind::Real(terms[0].clone())
-            }
-            Builtin::Chirp => {
-                need(self, 1, &rate);
-                need(self, 2, &rate);
-                need(self, 3, &time);
-                Kind::Real(terms[0].clone())
-            }
-            Builtin::Noise => {
-                need(self, 1, &time);
-                need(self, 2, &none);
-                Kind::Real(terms[0].clone())
             }
         }
+        let none = Term::known(Dimension::NONE);
+        let fitting = of(Units::Same).map(|(_, term)| term).find(|term| term.unknowns.is_empty());
+        let same = fitting.or(first.map(|(_, term)| term)).unwrap_or(&none);
+        for ((argument, arg), term) in signature.arguments.iter().zip(args).zip(&terms) {
+            let wanted = match argument.1 {
+                Units::Same | Units::RootOfSame | Units::Any => continue,
+                Units::Number => {
+                    if !self.unify(term, &none) {
+                        self.not_a_number(builtin, *arg, term);
+                        // Rounding a quantity requires a unit to round to; the SI unit would be a guess.
+                        if builtin == Builtin::Floor {
+                            return Kind::Unknown;
+                        }
+                    }
+                    continue;
+                }
+                Units::Time => Term::known(TIME),
+                Units::Frequency => Term::known(RATE),
+                Units::SamePerTime => same.times(&Term::known(RATE), Ratio::ONE),
+            };
+            if !self.unify(term, &wanted) {
+                self.mismatch(*arg, term, &wanted);
+            }
+        }
+        Kind::Real(match signature.result {
+            Units::Number | Units::Any => none,
+            Units::Same => same.clone(),
+            Units::RootOfSame => none.times(same, Ratio::new(1, 2)),
+            Units::Time => Term::known(TIME),
+            Units::Frequency => Term::known(RATE),
+            Units::SamePerTime => same.times(&Term::known(RATE), Ratio::ONE),
+        })
+    }
+
+    /// E0104: an argument that must be a pure number has a unit.
+    fn not_a_number(&mut self, builtin: Builtin, arg: ExprId, term: &Term) {
+        let (unit, text) = (self.shown(term), self.text(arg));
+        let message = format!("`{}` needs a pure number, not {}", builtin.name(), self.described(term));
+        let (label, help) = match builtin {
+            Builtin::Floor => (
+                format!("whole numbers of {unit}, or of what?"),
+                format!("say of what: `(1 {unit}) * floor({text} / (1 {unit}))`"),
+            ),
+            _ => (unit.clone(), format!("divide by a quantity of the same kind: `{text} / 1 {unit}`")),
+        };
+        self.diagnostics.push(Diagnostic::error("E0104", message).label(self.system.span(arg), label).help(help));
     }
 
     fn fits(&mut self, value: ExprId, dimension: Dimension, role: &Role) -> Kind {

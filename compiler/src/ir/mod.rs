@@ -17,6 +17,7 @@ pub mod interpret;
 pub mod program;
 pub mod random;
 
+pub use crate::functions::{Binary, Unary};
 use abi::Slot;
 
 /// The result of the operation with this number.
@@ -39,36 +40,6 @@ pub enum Type {
     Int,
     /// A Boolean.
     Bool,
-}
-
-/// Elementary functions of one argument. [`expand`](crate::math) turns them into arithmetic before any back end.
-#[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
-#[allow(missing_docs)]
-pub enum Unary {
-    Exp,
-    Expm1,
-    Log,
-    Log1p,
-    Sin,
-    Cos,
-    Tan,
-    Asin,
-    Acos,
-    Atan,
-    Sinh,
-    Cosh,
-    Tanh,
-}
-
-/// Elementary functions of two arguments.
-#[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
-#[allow(missing_docs)]
-pub enum Binary {
-    /// `atan2(y, x)`
-    Atan2,
-    /// `a ^ b`
-    Pow,
-    Hypot,
 }
 
 /// An operation. Its operands are values of earlier operations.

@@ -11,7 +11,7 @@
 //! The listing is exact: [`parse`](super::parse::parse) reads it back. Reals have as many digits as identify them; a NaN
 //! other than `f64::NAN` shows its bits.
 
-use super::{Binary, Func, Op, Unary, Value, Write};
+use super::{Func, Op, Value, Write};
 use std::fmt;
 
 impl fmt::Display for Value {
@@ -89,61 +89,10 @@ impl fmt::Display for Func {
     }
 }
 
-impl Unary {
-    /// All elementary functions of one argument.
-    pub const ALL: [Unary; 13] = [
-        Unary::Exp,
-        Unary::Expm1,
-        Unary::Log,
-        Unary::Log1p,
-        Unary::Sin,
-        Unary::Cos,
-        Unary::Tan,
-        Unary::Asin,
-        Unary::Acos,
-        Unary::Atan,
-        Unary::Sinh,
-        Unary::Cosh,
-        Unary::Tanh,
-    ];
-
-    /// The name in the language.
-    pub fn name(self) -> &'static str {
-        match self {
-            Unary::Exp => "exp",
-            Unary::Expm1 => "expm1",
-            Unary::Log => "log",
-            Unary::Log1p => "log1p",
-            Unary::Sin => "sin",
-            Unary::Cos => "cos",
-            Unary::Tan => "tan",
-            Unary::Asin => "asin",
-            Unary::Acos => "acos",
-            Unary::Atan => "atan",
-            Unary::Sinh => "sinh",
-            Unary::Cosh => "cosh",
-            Unary::Tanh => "tanh",
-        }
-    }
-}
-
-impl Binary {
-    /// All elementary functions of two arguments.
-    pub const ALL: [Binary; 3] = [Binary::Atan2, Binary::Pow, Binary::Hypot];
-
-    /// The name in the language, and `pow` for `^`.
-    pub fn name(self) -> &'static str {
-        match self {
-            Binary::Atan2 => "atan2",
-            Binary::Pow => "pow",
-            Binary::Hypot => "hypot",
-        }
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::ir::Unary;
     use abi::Slot;
 
     #[test]

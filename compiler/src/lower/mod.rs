@@ -924,7 +924,7 @@ fn believed(system: &System) -> Vec<VarId> {
         let var = system.var(*id);
         let ranged = var.range.low.is_some() || var.range.high.is_some();
         let computed = matches!(var.definition, Definition::Value(..));
-        if crate::ranges::interval::planted::is("beliefs are not watched") {
+        if crate::interval::planted::is("beliefs are not watched") {
             return false;
         }
         if !ranged || !computed || !matches!(var.kind, VarKind::Input | VarKind::Let) {
@@ -1338,7 +1338,6 @@ impl<'a> Emit<'a> {
     }
 
     fn call(&mut self, builtin: Builtin, args: &[Value]) -> Value {
-        let unary = |emit: &mut Self, function: Unary| emit.build.unary(function, args[0]);
         match builtin {
             Builtin::Abs => self.build.abs(args[0]),
             Builtin::Sign => self.build.sign(args[0]),
@@ -1347,21 +1346,8 @@ impl<'a> Emit<'a> {
             Builtin::Clamp => self.build.clamp(args[0], args[1], args[2]),
             Builtin::Floor => self.build.floor(args[0]),
             Builtin::Sqrt => self.build.sqrt(args[0]),
-            Builtin::Exp => unary(self, Unary::Exp),
-            Builtin::Expm1 => unary(self, Unary::Expm1),
-            Builtin::Log => unary(self, Unary::Log),
-            Builtin::Log1p => unary(self, Unary::Log1p),
-            Builtin::Sin => unary(self, Unary::Sin),
-            Builtin::Cos => unary(self, Unary::Cos),
-            Builtin::Tan => unary(self, Unary::Tan),
-            Builtin::Asin => unary(self, Unary::Asin),
-            Builtin::Acos => unary(self, Unary::Acos),
-            Builtin::Atan => unary(self, Unary::Atan),
-            Builtin::Sinh => unary(self, Unary::Sinh),
-            Builtin::Cosh => unary(self, Unary::Cosh),
-            Builtin::Tanh => unary(self, Unary::Tanh),
-            Builtin::Atan2 => self.build.binary(Binary::Atan2, args[0], args[1]),
-            Builtin::Hypot => self.build.binary(Binary::Hypot, args[0], args[1]),
+            Builtin::Unary(function) => self.build.unary(function, args[0]),
+            Builtin::Binary(function) => self.build.binary(function, args[0], args[1]),
             Builtin::Random => self.random(args[0], args[1]),
             Builtin::Step => {
                 let time = self.time();

@@ -3,6 +3,7 @@
 use super::two_to;
 use super::{POOL, expand};
 use crate::codegen::jit::compile;
+use crate::functions::Symmetry;
 use crate::ir::build::Build;
 use crate::ir::random::Random;
 use crate::ir::{Binary, Unary};
@@ -114,48 +115,42 @@ fn check(name: &str, code: &Code, exact: impl Fn(f64, f64) -> f64, ranges: &[(Ra
     }
 }
 
-fn check_one(function: Unary, exact: One, ranges: Vec<Range>, most: u64) {
-    let ranges: Vec<(Range, Range)> = ranges.into_iter().map(|range| (range, Range::Within(0.0, 1.0))).collect();
-    check(function.name(), &of_one(function), |x, _| exact(x), &ranges, most);
+/// A function for comparison, the ranges in which it is compared, and the largest distance.
+fn reference(function: Unary) -> (One, Vec<Range>, u64) {
+    use Range::{Any, Powers, Within};
+    use core_math as m;
+    match function {
+        Unary::Exp => {
+            (m::exp, vec![Within(-708.0, 709.7), Within(-1.0, 1.0), Powers(-60, 4), Within(-745.2, -708.0), Any], 1)
+        }
+        Unary::Expm1 => (m::expm1, vec![Within(-40.0, 709.7), Within(-1.0, 1.0), Powers(-60, 2), Any], 1),
+        Unary::Log => {
+            (m::log, vec![Within(0.0, 10.0), Within(0.9, 1.1), Within(0.999, 1.001), Powers(-1070, 1023), Any], 1)
+        }
+        Unary::Log1p => {
+            (m::log1p, vec![Within(-1.0, 10.0), Within(-0.1, 0.1), Powers(-60, 2), Powers(0, 1023), Any], 1)
+        }
+        Unary::Sin => (m::sin, vec![Within(-4.0, 4.0), Within(-1e6, 1e6), Powers(-60, 20), Within(-1e12, 1e12)], 1),
+        Unary::Cos => (m::cos, vec![Within(-4.0, 4.0), Within(-1e6, 1e6), Powers(-60, 20), Within(-1e12, 1e12)], 1),
+        Unary::Tan => (m::tan, vec![Within(-1.6, 1.6), Within(-1e6, 1e6), Powers(-60, 20)], 2),
+        Unary::Asin => (m::asin, vec![Within(-1.0, 1.0), Within(0.49, 0.51), Powers(-60, 0), Any], 2),
+        Unary::Acos => {
+            (m::acos, vec![Within(-1.0, 1.0), Within(0.99, 1.0), Within(-0.51, -0.49), Powers(-60, 0), Any], 2)
+        }
+        Unary::Atan => (m::atan, vec![Within(-1.0, 1.0), Within(-100.0, 100.0), Powers(-60, 70), Any], 2),
+        Unary::Sinh => (m::sinh, vec![Within(-710.4, 710.4), Within(-1.0, 1.0), Powers(-60, 5), Any], 2),
+        Unary::Cosh => (m::cosh, vec![Within(-710.4, 710.4), Within(-1.0, 1.0), Powers(-60, 5), Any], 2),
+        Unary::Tanh => (m::tanh, vec![Within(-20.0, 20.0), Within(-1.0, 1.0), Powers(-60, 5), Any], 1),
+    }
 }
 
 #[test]
 fn accuracy_of_functions_of_one_argument() {
-    use Range::{Any, Powers, Within};
-    use core_math as m;
-    check_one(
-        Unary::Exp,
-        m::exp,
-        vec![Within(-708.0, 709.7), Within(-1.0, 1.0), Powers(-60, 4), Within(-745.2, -708.0), Any],
-        1,
-    );
-    check_one(Unary::Expm1, m::expm1, vec![Within(-40.0, 709.7), Within(-1.0, 1.0), Powers(-60, 2), Any], 1);
-    check_one(
-        Unary::Log,
-        m::log,
-        vec![Within(0.0, 10.0), Within(0.9, 1.1), Within(0.999, 1.001), Powers(-1070, 1023), Any],
-        1,
-    );
-    check_one(
-        Unary::Log1p,
-        m::log1p,
-        vec![Within(-1.0, 10.0), Within(-0.1, 0.1), Powers(-60, 2), Powers(0, 1023), Any],
-        1,
-    );
-    check_one(Unary::Sin, m::sin, vec![Within(-4.0, 4.0), Within(-1e6, 1e6), Powers(-60, 20), Within(-1e12, 1e12)], 1);
-    check_one(Unary::Cos, m::cos, vec![Within(-4.0, 4.0), Within(-1e6, 1e6), Powers(-60, 20), Within(-1e12, 1e12)], 1);
-    check_one(Unary::Tan, m::tan, vec![Within(-1.6, 1.6), Within(-1e6, 1e6), Powers(-60, 20)], 2);
-    check_one(Unary::Asin, m::asin, vec![Within(-1.0, 1.0), Within(0.49, 0.51), Powers(-60, 0), Any], 2);
-    check_one(
-        Unary::Acos,
-        m::acos,
-        vec![Within(-1.0, 1.0), Within(0.99, 1.0), Within(-0.51, -0.49), Powers(-60, 0), Any],
-        2,
-    );
-    check_one(Unary::Atan, m::atan, vec![Within(-1.0, 1.0), Within(-100.0, 100.0), Powers(-60, 70), Any], 2);
-    check_one(Unary::Sinh, m::sinh, vec![Within(-710.4, 710.4), Within(-1.0, 1.0), Powers(-60, 5), Any], 2);
-    check_one(Unary::Cosh, m::cosh, vec![Within(-710.4, 710.4), Within(-1.0, 1.0), Powers(-60, 5), Any], 2);
-    check_one(Unary::Tanh, m::tanh, vec![Within(-20.0, 20.0), Within(-1.0, 1.0), Powers(-60, 5), Any], 1);
+    for function in Unary::ALL {
+        let (exact, ranges, most) = reference(function);
+        let ranges: Vec<(Range, Range)> = ranges.into_iter().map(|range| (range, Range::Within(0.0, 1.0))).collect();
+        check(function.name(), &of_one(function), |x, _| exact(x), &ranges, most);
+    }
 }
 
 #[test]
@@ -215,22 +210,8 @@ fn special_cases_are_those_of_ieee_754() {
         let fits = distance(found, expected) <= 1 && (expected != 0.0 || found.to_bits() == expected.to_bits());
         assert!(fits, "{name}({x:?}, {y:?}) = {found:?} and not {expected:?}");
     };
-    let unary: [(Unary, One); 13] = [
-        (Unary::Exp, m::exp),
-        (Unary::Expm1, m::expm1),
-        (Unary::Log, m::log),
-        (Unary::Log1p, m::log1p),
-        (Unary::Sin, m::sin),
-        (Unary::Cos, m::cos),
-        (Unary::Tan, m::tan),
-        (Unary::Asin, m::asin),
-        (Unary::Acos, m::acos),
-        (Unary::Atan, m::atan),
-        (Unary::Sinh, m::sinh),
-        (Unary::Cosh, m::cosh),
-        (Unary::Tanh, m::tanh),
-    ];
-    for (function, exact) in unary {
+    for function in Unary::ALL {
+        let (exact, ..) = reference(function);
         let code = of_one(function);
         let periodic = matches!(function, Unary::Sin | Unary::Cos | Unary::Tan);
         for &x in &edges {
@@ -288,11 +269,10 @@ fn variants_for_a_known_sign_change_no_bit() {
 #[test]
 fn symmetry_is_exact() {
     let mut random = Random(77);
-    for function in
-        [Unary::Sin, Unary::Tan, Unary::Asin, Unary::Atan, Unary::Sinh, Unary::Tanh, Unary::Cos, Unary::Cosh]
-    {
+    for function in Unary::ALL {
+        let Some(symmetry) = function.row().symmetry else { continue };
         let code = of_one(function);
-        let even = matches!(function, Unary::Cos | Unary::Cosh);
+        let even = symmetry == Symmetry::Even;
         for _ in 0..2000 {
             let x = Range::Powers(-30, 10).sample(&mut random);
             let (plus, minus) = (run(&code, x, 0.0), run(&code, -x, 0.0));

@@ -8,10 +8,11 @@
 //!
 //! Source: Griewank, Walther, *Evaluating Derivatives*, 2008, ch. 3 and 7.
 
+use crate::functions::Term;
 use crate::ir::build::{Build, Env};
 use crate::ir::expr::{Real, Shared};
 use crate::ir::program::Program;
-use crate::ir::{Binary, Func, Op, Unary, Value};
+use crate::ir::{Func, Op, Value};
 use abi::Slot;
 use std::collections::HashMap;
 
@@ -224,43 +225,10 @@ fn gradient<'a, 'g>(build: &'a Shared, op: Op, y: Value, of: &dyn Fn(usize) -> &
             merge(&product, of(2), |a, b| Some(sum(build, a, b)))
         }
         Op::Floor(_) | Op::Nearest(_) => Gradient::new(),
-        Op::Unary(function, a) => {
-            let a = at(a);
-            let call = |function: Unary| at(build.borrow_mut().unary(function, a.value));
-            chain(&|| match function {
-                Unary::Exp => y,
-                Unary::Expm1 => y + 1.0,
-                Unary::Log => 1.0 / a,
-                Unary::Log1p => 1.0 / (1.0 + a),
-                Unary::Sin => call(Unary::Cos),
-                Unary::Cos => -call(Unary::Sin),
-                Unary::Tan => y.fma(y, 1.0),
-                Unary::Asin => 1.0 / ((1.0 - a) * (1.0 + a)).sqrt(),
-                Unary::Acos => -1.0 / ((1.0 - a) * (1.0 + a)).sqrt(),
-                Unary::Atan => 1.0 / a.fma(a, 1.0),
-                Unary::Sinh => call(Unary::Cosh),
-                Unary::Cosh => call(Unary::Sinh),
-                Unary::Tanh => (1.0 - y) * (1.0 + y),
-            })
-        }
+        Op::Unary(function, a) => chain(&|| formula(function.row().derivative, at(a), at(a), y)),
         Op::Binary(function, a, b) => {
-            let (a, b) = (at(a), at(b));
-            match function {
-                // For operands y and x: (x dy − y dx)/(x² + y²)
-                Binary::Atan2 => both(&|| b / a.fma(a, b * b), &|| -(a / a.fma(a, b * b))),
-                // d(a^b) = b a^b/a da + a^b log a db. The first factor is 1 for b = 1. At a = 0 it is otherwise 0, even
-                // where it would be infinite, and the second is 0, so that derivatives stay finite.
-                Binary::Pow => {
-                    let log = || at(build.borrow_mut().unary(Unary::Log, a.value));
-                    let slope = || b.is(1.0).choose(1.0, a.is(0.0).choose(0.0, b * (y / a)));
-                    both(&slope, &|| a.above(0.0).choose(y * log(), 0.0))
-                }
-                // The gradient is undefined at the origin; 0 is used.
-                Binary::Hypot => {
-                    let share = |x: Real<'a>| y.above(0.0).choose(x / y, 0.0);
-                    both(&|| share(a), &|| share(b))
-                }
-            }
+            let [of_a, of_b] = function.row().derivatives;
+            both(&|| formula(of_a, at(a), at(b), y), &|| formula(of_b, at(a), at(b), y))
         }
         Op::Select(condition, ..) => merge(of(1), of(2), |a, b| {
             let mut build = build.borrow_mut();
@@ -274,6 +242,28 @@ fn gradient<'a, 'g>(build: &'a Shared, op: Op, y: Value, of: &dyn Fn(usize) -> &
         Op::ShiftLeft(..) | Op::ShiftRight(..) | Op::ShiftRightSigned(..) => Gradient::new(),
         Op::IntLess(..) | Op::IntEqual(..) => Gradient::new(),
         Op::ToBits(_) | Op::FromBits(_) | Op::ToInt(_) | Op::ToReal(_) => Gradient::new(),
+    }
+}
+
+/// A term of a derivative, for f = f(x, y).
+fn formula<'a>(term: &Term, x: Real<'a>, y: Real<'a>, f: Real<'a>) -> Real<'a> {
+    let part = |term: &Term| formula(term, x, y, f);
+    match *term {
+        Term::X => x,
+        Term::Y => y,
+        Term::F => f,
+        Term::Number(number) => x.constant(number),
+        Term::Negate(a) => -part(a),
+        Term::Sum(a, b) => part(a) + part(b),
+        Term::Difference(a, b) => part(a) - part(b),
+        Term::Product(a, b) => part(a) * part(b),
+        Term::Quotient(&Term::Number(a), b) => a / part(b),
+        Term::Quotient(a, b) => part(a) / part(b),
+        Term::Fused(a, b, c) => part(a).fma(part(b), part(c)),
+        Term::Root(a) => part(a).sqrt(),
+        Term::Call(function, a) => part(a).of(function),
+        Term::IfPositive(a, b, c) => part(a).above(0.0).choose(part(b), part(c)),
+        Term::IfEqual(a, number, b, c) => part(a).is(number).choose(part(b), part(c)),
     }
 }
 
@@ -316,6 +306,7 @@ fn merge(a: &Gradient, b: &Gradient, mut join: impl FnMut(Option<Value>, Option<
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::functions::{Binary, Domain, Unary};
     use crate::ir::interpret::run_once;
     use crate::ir::random::Random;
     use crate::math::{POOL, expand};
@@ -367,20 +358,8 @@ mod tests {
     #[test]
     fn elementary_functions_against_central_differences() {
         for function in Unary::ALL {
-            let (lo, hi) = match function {
-                Unary::Log => (0.2, 5.0),
-                Unary::Asin | Unary::Acos => (-0.9, 0.9),
-                Unary::Log1p => (-0.8, 3.0),
-                Unary::Exp
-                | Unary::Expm1
-                | Unary::Sin
-                | Unary::Cos
-                | Unary::Tan
-                | Unary::Atan
-                | Unary::Sinh
-                | Unary::Cosh
-                | Unary::Tanh => (-1.2, 1.2),
-            };
+            let Domain { low, high, .. } = function.row().domain;
+            let (lo, hi) = ((low + 0.1).max(-1.2), (high - 0.1).min(1.2));
             let program = program(1, |b, layout| {
                 let x = b.load(layout.states.slot(0));
                 let y = b.unary(function, x);

@@ -18,7 +18,7 @@
 //! *Combinatorial Merging and Huffman's Algorithm*, 1979 (operands that are ready first are combined first).
 
 use crate::ir::build::Build;
-use crate::ir::{Binary, Func, Op, Unary, Value};
+use crate::ir::{Func, Op, Value};
 use abi::Slot;
 use std::collections::HashSet;
 
@@ -112,13 +112,8 @@ pub(super) fn latency(op: Op) -> i32 {
         Op::IntMul(..) | Op::IntLess(..) | Op::IntEqual(..) => 3,
         Op::ToBits(_) | Op::FromBits(_) => 3,
         Op::Pool { .. } | Op::Ring { .. } | Op::ToInt(_) | Op::ToReal(_) => 7,
-        Op::Unary(Unary::Exp, _) => 36,
-        Op::Unary(Unary::Log | Unary::Expm1 | Unary::Log1p | Unary::Sin | Unary::Cos, _) => 45,
-        Op::Unary(
-            Unary::Tan | Unary::Asin | Unary::Acos | Unary::Atan | Unary::Sinh | Unary::Cosh | Unary::Tanh,
-            _,
-        ) => 80,
-        Op::Binary(Binary::Atan2 | Binary::Pow | Binary::Hypot, ..) => 100,
+        Op::Unary(function, _) => function.row().latency,
+        Op::Binary(function, ..) => function.row().latency,
     }
 }
 
@@ -310,6 +305,7 @@ impl<'a> Pass<'a> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::ir::Unary;
     use crate::ir::expr::{Real, Shared};
     use crate::ir::random::Random;
     use abi::Layout;

@@ -10,7 +10,8 @@
 
 use crate::frontend::causality::rate_of;
 use crate::frontend::system::*;
-use crate::ranges::interval::{Interval, planted};
+use crate::functions::{self, Binary};
+use crate::interval::{Interval, SLACK, planted};
 use abi::description::TINY;
 pub use abi::live::{greatest, least};
 use grammar::ast::BinaryOp;
@@ -326,7 +327,7 @@ impl<'a> Reach<'a> {
                 let high = if inside.high > 0.0 { inside.high * inside.high * (1.0 + SLACK) } else { inside.high };
                 self.constrain(args[0], Interval::closed(low, high), id, deep)
             }
-            Node::Call(Builtin::Hypot, args) => {
+            Node::Call(Builtin::Binary(Binary::Hypot), args) => {
                 let most = inside.high * (1.0 + SLACK);
                 let both = Interval::closed(-most, most);
                 self.constrain(args[0], both, id, deep).and(self.constrain(args[1], both, id, deep))
@@ -568,7 +569,7 @@ impl<'a> Reach<'a> {
                     Some(0.5) => x.sqrt(),
                     _ => {
                         let n = self.interval(b);
-                        general_power(x, n)
+                        (Binary::Pow.row().image)(x, n)
                     }
                 }
             }
@@ -658,7 +659,6 @@ impl<'a> Reach<'a> {
             return Interval::EMPTY;
         }
         let unit = Interval::closed(-1.0, 1.0);
-        let half_turn = std::f64::consts::PI.next_up();
         match builtin {
             Builtin::Abs => values[0].abs(),
             Builtin::Sign => {
@@ -672,28 +672,8 @@ impl<'a> Reach<'a> {
             Builtin::Floor if planted::is("the floor of a positive number is positive") => values[0],
             Builtin::Floor => Interval::closed(values[0].low.floor(), values[0].high.floor()),
             Builtin::Sqrt => values[0].sqrt(),
-            Builtin::Exp => {
-                // exp(x) is at most 1 for x ≤ 0, and at least 1 for x ≥ 0.
-                let most = if values[0].high <= 0.0 { 1.0 } else { f64::INFINITY };
-                let least = if values[0].low >= 0.0 { 1.0 } else { 0.0 };
-                let least = if planted::is("exponentials are never zero") { f64::from_bits(1) } else { least };
-                values[0].rising(bounds::exp, (least, most))
-            }
-            Builtin::Expm1 => keeping_sign(values[0], values[0].rising(bounds::expm1, (-1.0, f64::INFINITY))),
-            Builtin::Log => values[0].and(Interval::from(0.0)).rising(bounds::log, LINE),
-            Builtin::Log1p => keeping_sign(values[0], values[0].and(Interval::from(-1.0)).rising(bounds::log1p, LINE)),
-            Builtin::Sin | Builtin::Cos => unit,
-            Builtin::Tanh if planted::is("tanh never reaches 1") => {
-                values[0].rising(bounds::tanh, ((-1.0_f64).next_up(), 1.0_f64.next_down()))
-            }
-            Builtin::Tanh => keeping_sign(values[0], values[0].rising(bounds::tanh, (-1.0, 1.0))),
-            Builtin::Sinh => keeping_sign(values[0], values[0].rising(bounds::sinh, LINE)),
-            Builtin::Atan => keeping_sign(values[0], values[0].rising(bounds::atan, (-2.0, 2.0))),
-            Builtin::Cosh => values[0].abs().rising(bounds::cosh, (1.0, f64::INFINITY)),
-            Builtin::Hypot => {
-                let least = values[0].away.max(values[1].away) * (1.0 - SLACK);
-                Interval::from(least).and(Interval::to((values[0].size() + values[1].size()) * (1.0 + SLACK)))
-            }
+            Builtin::Unary(function) => function.image(values[0]),
+            Builtin::Binary(function) => (function.row().image)(values[0], values[1]),
             Builtin::Delay => values[0].rounded(),
             Builtin::Random => Interval::closed(0.0, 1.0_f64.next_down()),
             Builtin::Step => values[1].hull(Interval::point(0.0)),
@@ -701,21 +681,12 @@ impl<'a> Reach<'a> {
             Builtin::Square => values[0].hull(values[0].negate()),
             Builtin::Sine | Builtin::Chirp | Builtin::Noise => unit.multiply(values[0]),
             Builtin::Ramp => values[1].plus(values[2].multiply(Interval::closed(0.0, HUGE))),
-            Builtin::Acos => Interval::closed(0.0, half_turn),
-            Builtin::Asin => Interval::closed(-2.0, 2.0),
-            Builtin::Atan2 => Interval::closed(-half_turn, half_turn),
-            Builtin::Tan => Interval::ALL,
         }
     }
 }
 
 /// Limit on the number of operations inverted in sequence.
 const DEEPEST: u32 = 8;
-
-/// Upper bound on the rounding errors of squares and roots.
-const SLACK: f64 = 1e-14;
-
-const LINE: (f64, f64) = (f64::NEG_INFINITY, f64::INFINITY);
 
 /// The largest whole exponent whose power is computed by multiplication.
 const MOST_MULTIPLIED: f64 = 64.0;
@@ -725,21 +696,12 @@ pub fn whole(n: f64) -> bool {
     n.fract() == 0.0 && n.abs() <= MOST_MULTIPLIED
 }
 
-/// An odd increasing function has the sign of its argument.
-fn keeping_sign(x: Interval, image: Interval) -> Interval {
-    match (x.low >= 0.0, x.high <= 0.0) {
-        (true, _) => image.and(Interval::from(0.0)),
-        (_, true) => image.and(Interval::to(0.0)),
-        _ => image,
-    }
-}
-
 /// The interval of x, given an interval of x^n with n even.
 fn roots_of(inside: Interval, n: u32) -> Interval {
     if inside.high < 0.0 {
         return Interval::EMPTY;
     }
-    let root = |x: f64| if n == 2 { x.sqrt() } else { bounds::pow(x, 1.0 / f64::from(n)) };
+    let root = |x: f64| if n == 2 { x.sqrt() } else { functions::root(x, n) };
     // A subnormal product has a relative error of up to a half, or underflows to 0.
     let away = match inside.low {
         low if low >= f64::MIN_POSITIVE => root(low) * (1.0 - SLACK),
@@ -749,70 +711,4 @@ fn roots_of(inside: Interval, n: u32) -> Interval {
     let most = if inside.high < f64::MIN_POSITIVE { 1e-150 } else { root(inside.high) * (1.0 + SLACK) };
     let most = if n == 2 || inside.high >= f64::MIN_POSITIVE { most } else { 1.0 };
     Interval::closed(-most, most).and(Interval::beyond(away))
-}
-
-/// x^n for x ≥ 0 and any n. It is monotonic in each argument, so its values at the corners bound it.
-fn general_power(x: Interval, n: Interval) -> Interval {
-    if x.is_empty() || n.is_empty() {
-        return Interval::EMPTY;
-    }
-    if !x.is_not_negative() || n.low.is_infinite() || n.high.is_infinite() {
-        return if x.is_not_negative() { Interval::from(0.0) } else { Interval::ALL };
-    }
-    let mut corners = Vec::new();
-    for x in [x.low, x.high] {
-        for n in [n.low, n.high] {
-            corners.push(bounds::pow(x, n));
-        }
-    }
-    let low = corners.iter().copied().fold(f64::INFINITY, f64::min);
-    let high = corners.iter().copied().fold(0.0, f64::max);
-    // The error of the logarithm grows with the exponent. The smallest results are rounded to 0.
-    let low = if low < 1e-300 { 0.0 } else { low * (1.0 - 1e-12) };
-    let high = high * (1.0 + 1e-12);
-    // 1 is exact: powers of x ≤ 1 with n ≥ 0 do not exceed it.
-    let high = if x.high <= 1.0 && n.low >= 0.0 { high.min(1.0) } else { high };
-    Interval::closed(low, high)
-}
-
-/// Elementary functions at the ends of intervals. No value of a run depends on them, so the platform's functions
-/// suffice.
-mod bounds {
-    #![expect(clippy::disallowed_methods, reason = "bounds of intervals, not values of a run")]
-
-    pub fn exp(x: f64) -> f64 {
-        x.exp()
-    }
-
-    pub fn expm1(x: f64) -> f64 {
-        x.exp_m1()
-    }
-
-    pub fn log(x: f64) -> f64 {
-        x.ln()
-    }
-
-    pub fn log1p(x: f64) -> f64 {
-        x.ln_1p()
-    }
-
-    pub fn tanh(x: f64) -> f64 {
-        x.tanh()
-    }
-
-    pub fn sinh(x: f64) -> f64 {
-        x.sinh()
-    }
-
-    pub fn cosh(x: f64) -> f64 {
-        x.cosh()
-    }
-
-    pub fn atan(x: f64) -> f64 {
-        x.atan()
-    }
-
-    pub fn pow(x: f64, y: f64) -> f64 {
-        x.powf(y)
-    }
 }

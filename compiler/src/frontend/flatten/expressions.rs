@@ -554,9 +554,9 @@ impl<'a> Flattener<'a> {
         }
         let values: Vec<ExprId> = args.iter().map(|arg| self.expr(arg, env)).collect();
         match Builtin::named(&function.text) {
-            Some((builtin, wanted)) if wanted == values.len() => self.builtin(builtin, values, span),
-            Some((_, wanted)) => {
-                self.wrong_count(function, wanted, args.len());
+            Some(builtin) if builtin.signature().arguments.len() == values.len() => self.builtin(builtin, values, span),
+            Some(builtin) => {
+                self.wrong_count(function, builtin.signature().arguments.len(), args.len());
                 self.error(span)
             }
             None if MeasureName::named(&function.text).is_some() => {
@@ -610,9 +610,7 @@ impl<'a> Flattener<'a> {
             return self.report(error);
         }
         let mut known = loaded.visible(env.file, Space::Function);
-        for name in Builtin::names() {
-            known.push(name);
-        }
+        Builtin::all().for_each(|builtin| known.push(builtin.name()));
         let help = match function.text.as_str() {
             "der" | "diff" | "ddt" => Some("a derivative is written `dz/dt`".to_string()),
             "sgn" | "signum" => Some("write `sign(…)`".into()),

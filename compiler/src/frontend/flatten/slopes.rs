@@ -6,6 +6,7 @@
 //! than differentiated to 0.
 
 use super::*;
+use crate::functions::{Term, Unary};
 
 /// Limit on the depth of the chain of quantities and operations.
 const DEEPEST_CHAIN: usize = 400;
@@ -180,7 +181,7 @@ impl<'a> Flattener<'a> {
             slopes.push(self.rate(*arg, known)?);
         }
         let call = |f: &mut Self, builtin, args: &[ExprId]| f.system.push(Node::Call(builtin, args.into()), span);
-        use BinaryOp::{Add, Divide, LessEqual, Multiply, Power, Subtract};
+        use BinaryOp::{Divide, LessEqual, Multiply};
         match builtin {
             Builtin::Ramp if slopes.iter().all(Option::is_none) => {
                 let time = self.system.push(Node::Time, span);
@@ -192,7 +193,7 @@ impl<'a> Flattener<'a> {
                 let (time, turn) = (self.system.push(Node::Time, span), self.plain(std::f64::consts::TAU, span));
                 let rate = self.operation(Multiply, turn, args[1], span);
                 let phase = self.operation(Multiply, rate, time, span);
-                let cosine = call(self, Builtin::Cos, &[phase]);
+                let cosine = call(self, Builtin::Unary(Unary::Cos), &[phase]);
                 let size = self.operation(Multiply, args[0], rate, span);
                 return Ok(Some(self.operation(Multiply, size, cosine, span)));
             }
@@ -202,83 +203,42 @@ impl<'a> Flattener<'a> {
         if slopes.iter().all(Option::is_none) {
             return Ok(None);
         }
-        let two = self.plain(2.0, span);
-        let one = self.plain(1.0, span);
-        let square = |f: &mut Self, x: ExprId| f.operation(Power, x, two, span);
         let choice = |f: &mut Self, at_most: ExprId, than: ExprId, a: Slope, b: Slope| {
             let condition = f.operation(LessEqual, at_most, than, span);
             let [a, b] = [a, b].map(|slope| slope.unwrap_or_else(|| f.system.push(zero(), span)));
             f.system.push(Node::If(condition, a, b), span)
         };
-        let x = args[0];
-        // Functions of one argument, by the chain rule: `factor` is the outer derivative.
-        let factor = match builtin {
-            Builtin::Min => return Ok(Some(choice(self, args[0], args[1], slopes[0], slopes[1]))),
-            Builtin::Max => return Ok(Some(choice(self, args[0], args[1], slopes[1], slopes[0]))),
+        Ok(match builtin {
+            Builtin::Min => Some(choice(self, args[0], args[1], slopes[0], slopes[1])),
+            Builtin::Max => Some(choice(self, args[0], args[1], slopes[1], slopes[0])),
             Builtin::Clamp => {
-                let upper = choice(self, args[2], x, slopes[2], slopes[0]);
-                return Ok(Some(choice(self, x, args[1], slopes[1], Some(upper))));
-            }
-            Builtin::Hypot | Builtin::Atan2 => {
-                let (y, x) = (args[0], args[1]);
-                let (dy, dx) = (slopes[0], slopes[1]);
-                let (left, right) = if builtin == Builtin::Hypot { (y, x) } else { (x, y) };
-                let left = dy.map(|dy| self.operation(Multiply, left, dy, span));
-                let right = dx.map(|dx| self.operation(Multiply, right, dx, span));
-                return Ok(match builtin {
-                    Builtin::Hypot => {
-                        let above = self.sum(left, right, span);
-                        above.map(|above| self.operation(Divide, above, id, span))
-                    }
-                    _ => {
-                        let right = right.map(|right| self.system.push(Node::Negate(right), span));
-                        let above = self.sum(left, right, span);
-                        let (xx, yy) = (square(self, x), square(self, y));
-                        let below = self.operation(Add, xx, yy, span);
-                        above.map(|above| self.operation(Divide, above, below, span))
-                    }
-                });
+                let upper = choice(self, args[2], args[0], slopes[2], slopes[0]);
+                Some(choice(self, args[0], args[1], slopes[1], Some(upper)))
             }
             Builtin::Sign | Builtin::Floor => return unknown("this jumps"),
-            Builtin::Abs => call(self, Builtin::Sign, &[x]),
+            Builtin::Abs => {
+                let sign = call(self, Builtin::Sign, &[args[0]]);
+                slopes[0].map(|slope| self.operation(Multiply, sign, slope, span))
+            }
             Builtin::Sqrt => {
+                let two = self.plain(2.0, span);
                 let twice = self.operation(Multiply, two, id, span);
-                return Ok(slopes[0].map(|slope| self.operation(Divide, slope, twice, span)));
+                slopes[0].map(|slope| self.operation(Divide, slope, twice, span))
             }
-            Builtin::Exp => id,
-            Builtin::Expm1 => call(self, Builtin::Exp, &[x]),
-            Builtin::Log => return Ok(slopes[0].map(|slope| self.operation(Divide, slope, x, span))),
-            Builtin::Log1p => {
-                let below = self.operation(Add, one, x, span);
-                return Ok(slopes[0].map(|slope| self.operation(Divide, slope, below, span)));
+            Builtin::Unary(function) => {
+                let factor = self.term(function.row().derivative, id, args, span);
+                slopes[0].map(|slope| self.operation(Multiply, factor, slope, span))
             }
-            Builtin::Sin => call(self, Builtin::Cos, &[x]),
-            Builtin::Cos => {
-                let sine = call(self, Builtin::Sin, &[x]);
-                self.system.push(Node::Negate(sine), span)
-            }
-            Builtin::Tan => {
-                let squared = square(self, id);
-                self.operation(Add, one, squared, span)
-            }
-            Builtin::Asin | Builtin::Acos => {
-                let squared = square(self, x);
-                let inside = self.operation(Subtract, one, squared, span);
-                let below = call(self, Builtin::Sqrt, &[inside]);
-                let slope = slopes[0].map(|slope| self.operation(Divide, slope, below, span));
-                let negative = builtin == Builtin::Acos;
-                return Ok(slope.map(|s| if negative { self.system.push(Node::Negate(s), span) } else { s }));
-            }
-            Builtin::Atan => {
-                let squared = square(self, x);
-                let below = self.operation(Add, one, squared, span);
-                return Ok(slopes[0].map(|slope| self.operation(Divide, slope, below, span)));
-            }
-            Builtin::Sinh => call(self, Builtin::Cosh, &[x]),
-            Builtin::Cosh => call(self, Builtin::Sinh, &[x]),
-            Builtin::Tanh => {
-                let squared = square(self, id);
-                self.operation(Subtract, one, squared, span)
+            Builtin::Binary(function) => {
+                let mut slope = None;
+                for (k, derivative) in function.row().derivatives.into_iter().enumerate() {
+                    if let Some(of_argument) = slopes[k] {
+                        let factor = self.term(derivative, id, args, span);
+                        let part = self.operation(Multiply, factor, of_argument, span);
+                        slope = self.sum(slope, Some(part), span);
+                    }
+                }
+                slope
             }
             Builtin::Step
             | Builtin::Ramp
@@ -289,8 +249,43 @@ impl<'a> Flattener<'a> {
             | Builtin::Noise
             | Builtin::Random
             | Builtin::Delay => unreachable!("signals have been looked at"),
+        })
+    }
+
+    /// A term of a derivative as an expression. `f`: the call of the function, with these arguments.
+    fn term(&mut self, term: &Term, f: ExprId, args: &[ExprId], span: Span) -> ExprId {
+        let mut part = |term: &Term| self.term(term, f, args, span);
+        let node = match *term {
+            Term::X => return args[0],
+            Term::Y => return args[1],
+            Term::F => return f,
+            // Zero fits every unit.
+            Term::Number(0.0) => zero(),
+            Term::Number(number) => return self.plain(number, span),
+            Term::Negate(a) => Node::Negate(part(a)),
+            Term::Sum(a, b) => Node::Binary(BinaryOp::Add, part(a), part(b)),
+            Term::Difference(a, b) => Node::Binary(BinaryOp::Subtract, part(a), part(b)),
+            Term::Product(a, b) => Node::Binary(BinaryOp::Multiply, part(a), part(b)),
+            Term::Quotient(a, b) => Node::Binary(BinaryOp::Divide, part(a), part(b)),
+            Term::Fused(a, b, c) => {
+                let (a, b, c) = (part(a), part(b), part(c));
+                let product = self.operation(BinaryOp::Multiply, a, b, span);
+                Node::Binary(BinaryOp::Add, product, c)
+            }
+            Term::Root(a) => Node::Call(Builtin::Sqrt, [part(a)].into()),
+            Term::Call(function, a) => Node::Call(Builtin::Unary(function), [part(a)].into()),
+            Term::IfPositive(a, b, c) => {
+                let (a, b, c) = (part(a), part(b), part(c));
+                let zero = self.system.push(zero(), span);
+                Node::If(self.operation(BinaryOp::Greater, a, zero, span), b, c)
+            }
+            Term::IfEqual(a, number, b, c) => {
+                let (a, b, c) = (part(a), part(b), part(c));
+                let number = self.plain(number, span);
+                Node::If(self.operation(BinaryOp::Equal, a, number, span), b, c)
+            }
         };
-        Ok(slopes[0].map(|slope| self.operation(Multiply, factor, slope, span)))
+        self.system.push(node, span)
     }
 
     fn operation(&mut self, op: BinaryOp, a: ExprId, b: ExprId, span: Span) -> ExprId {

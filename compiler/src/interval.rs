@@ -17,6 +17,9 @@ const LEAST: f64 = f64::from_bits(1);
 /// Bound on the relative error of an elementary function; those of `math` are accurate to one unit in the last place.
 const ELEMENTARY: f64 = 4.0 * f64::EPSILON;
 
+/// Upper bound on the rounding errors of squares and roots.
+pub const SLACK: f64 = 1e-14;
+
 /// All doubles x with `low` ≤ x ≤ `high` and |x| ≥ `away`.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub struct Interval {
@@ -238,11 +241,17 @@ impl Interval {
             return self;
         }
         let (low, high) = (f(self.low), f(self.high));
-        // The relative error of a subnormal value is larger.
-        let low = if low.abs() < f64::MIN_POSITIVE && low > 0.0 { 0.0 } else { low - ELEMENTARY * low.abs() };
-        let high = if high.abs() < f64::MIN_POSITIVE && high < 0.0 { 0.0 } else { high + ELEMENTARY * high.abs() };
-        // f(x) keeps the sign that it has at the ends: a value of 0 there is exact or has underflowed.
-        Interval::closed(low.max(limits.0), high.min(limits.1))
+        // The relative error of a subnormal value is larger. f(x) keeps the sign that it has at the ends: a value of 0
+        // there is exact or has underflowed.
+        let error = |y: f64| match y.abs() {
+            0.0 => 0.0,
+            size if size < f64::MIN_POSITIVE => 4.0 * LEAST,
+            size => ELEMENTARY * size,
+        };
+        let (least, most) = (low - error(low), high + error(high));
+        let least = if low > 0.0 { least.max(0.0) } else { least };
+        let most = if high < 0.0 { most.min(0.0) } else { most };
+        Interval::closed(least.max(limits.0), most.min(limits.1))
     }
 
     /// Moves each end outwards by the rounding error relative to that end.
