@@ -201,12 +201,22 @@ impl Interval {
 
     /// a^n by repeated multiplication
     pub fn power(self, n: u32) -> Interval {
-        let mut out = if n % 2 == 1 { self } else { Interval::point(1.0) };
-        let square = self.square();
-        for _ in 0..n / 2 {
-            out = out.multiply(square);
+        if self.is_empty() {
+            return self;
         }
-        out
+        // It rises with a, or with |a| if n is even.
+        let base = if n % 2 == 1 { self } else { self.abs() };
+        // By repeated squaring, as `lower` does: another order would round differently.
+        let of = |x: f64| {
+            let (mut power, mut square, mut rest) = (Interval::point(1.0), Interval::closed(x, x), n);
+            while rest > 0 {
+                power = if rest % 2 == 1 { power.multiply(square) } else { power };
+                rest /= 2;
+                square = if rest > 0 { square.multiply(square) } else { square };
+            }
+            power
+        };
+        Interval { low: of(base.low).low, high: of(base.high).high, away: of(base.away).low.max(0.0) }.normal()
     }
 
     /// min(a, b)

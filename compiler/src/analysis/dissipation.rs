@@ -5,10 +5,11 @@
 //! reference interpreter evaluates the model's own functions on a fixed grid. If the grid contains no violation of
 //! dissipation, a proof by intervals is tried. The work is bounded, and the result does not depend on the machine.
 
-use crate::analysis::interval_proof::{Claim, Range, prove};
+use crate::analysis::interval_proof::{Claim, prove};
 use crate::analysis::memo::Memo;
 use crate::frontend::system::*;
-use crate::frontend::units::{Types, three_digits};
+use crate::frontend::units::Types;
+use crate::interval::Interval;
 use crate::ir::build::{Build, Env};
 use crate::ir::expr::Shared;
 use crate::ir::program::Program;
@@ -275,17 +276,17 @@ fn proved(system: &System, contact: &Contact, bench: &mut Bench) -> bool {
             if least >= most {
                 continue;
             }
-            let mut inputs = vec![(bench.v, Range { low: least, high: most })];
+            let mut inputs = vec![(bench.v, Interval::closed(least, most))];
             if let (Some(slot), Some(_)) = (bench.external, contact.external) {
                 let (low, high) = range(slot).unwrap_or((f64::NEG_INFINITY, f64::INFINITY));
-                inputs.push((slot, Range { low: low.max(-LARGEST_LOAD), high: high.min(LARGEST_LOAD) }));
+                inputs.push((slot, Interval::closed(low.max(-LARGEST_LOAD), high.min(LARGEST_LOAD))));
             }
             for k in (0..layout.states.len as usize).filter(|k| bench.matters[*k]) {
                 let slot = layout.states.slot(k);
                 let Some((low, high)) = range(slot).filter(|(low, high)| low.is_finite() && high.is_finite()) else {
                     return false;
                 };
-                inputs.push((slot, Range { low, high }));
+                inputs.push((slot, Interval::closed(low, high)));
             }
             let build = Shared::new(Build::new("dissipation").with_pool(description.pool.clone()));
             let mut env = Env::new();

@@ -10,19 +10,11 @@
 //! box at that number. Bounds are rounded outwards. A sum counts as zero if it is negative by no more than 1e-12 of its
 //! terms, because coefficients of equal products may differ in their last digits.
 
-use crate::ir::{Binary, Func, Op, Unary, Value};
+use crate::interval::Interval;
+use crate::ir::{Func, Op, Value};
 use abi::Slot;
 use std::collections::{BTreeMap, HashMap};
 use std::rc::Rc;
-
-/// A closed, non-empty interval.
-#[derive(Clone, Copy, PartialEq, Debug)]
-pub struct Range {
-    /// Least value; may be infinite.
-    pub low: f64,
-    /// Greatest value; may be infinite.
-    pub high: f64,
-}
 
 /// A claim about a function: one of the values `any` is non-negative wherever none of the conditions `unless` holds.
 pub struct Claim<'a> {
@@ -43,7 +35,7 @@ const DEEPEST: u32 = 60;
 
 /// Proves a claim for all inputs in `inputs`. Returns false if there is no proof within `work` steps of a few
 /// operations each. Subtracts the steps taken from `work`.
-pub fn prove(claim: &Claim, inputs: &[(Slot, Range)], pool: &[f64], work: &mut usize) -> bool {
+pub fn prove(claim: &Claim, inputs: &[(Slot, Interval)], pool: &[f64], work: &mut usize) -> bool {
     let live = claim.func.live();
     let mut stack = vec![Cell { inputs: inputs.to_vec(), facts: Vec::new(), depth: 0 }];
     while let Some(cell) = stack.pop() {
@@ -69,7 +61,7 @@ pub fn prove(claim: &Claim, inputs: &[(Slot, Range)], pool: &[f64], work: &mut u
 /// A box, with the known results of comparisons in it.
 #[derive(Clone)]
 struct Cell {
-    inputs: Vec<(Slot, Range)>,
+    inputs: Vec<(Slot, Interval)>,
     facts: Vec<(Value, bool)>,
     depth: u32,
 }
@@ -131,184 +123,72 @@ impl Sum {
 struct Bounds<'a> {
     func: &'a Func,
     cell: &'a Cell,
-    ranges: Vec<Range>,
+    ranges: Vec<Interval>,
     truths: Vec<Option<bool>>,
     sums: Vec<Option<Rc<Sum>>>,
     /// Opaque terms that stand for the reciprocal of a sum, by the index of the sum.
-    inverse: HashMap<u32, Range>,
+    inverse: HashMap<u32, Interval>,
     work: &'a mut usize,
 }
 
-const ALL: Range = Range { low: f64::NEG_INFINITY, high: f64::INFINITY };
-
-impl Range {
-    /// The hull of these values, rounded outwards; [`ALL`] if one of them is NaN.
-    fn around(values: &[f64]) -> Range {
-        if values.iter().any(|x| x.is_nan()) {
-            return ALL;
-        }
-        let (low, high) = values.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), x| (l.min(*x), h.max(*x)));
-        Range { low: low.next_down(), high: high.next_up() }
-    }
-
-    fn point(x: f64) -> Range {
-        if x.is_nan() { ALL } else { Range { low: x, high: x } }
-    }
-
-    fn add(self, other: Range) -> Range {
-        Range::around(&[self.low + other.low, self.high + other.high])
-    }
-
-    fn negate(self) -> Range {
-        Range { low: -self.high, high: -self.low }
-    }
-
-    fn multiply(self, other: Range) -> Range {
-        // 0 · inf is 0, since an infinite end is never attained.
-        let product = |a: f64, b: f64| if a == 0.0 || b == 0.0 { 0.0 } else { a * b };
-        let ends = [
-            product(self.low, other.low),
-            product(self.low, other.high),
-            product(self.high, other.low),
-            product(self.high, other.high),
-        ];
-        let mut out = Range::around(&ends);
-        // Keeps exact zeros, which are the most common ends.
-        for (end, exact) in [(&mut out.low, f64::min as fn(f64, f64) -> f64), (&mut out.high, f64::max)] {
-            let bound = ends.into_iter().reduce(exact).expect("there are four");
-            if bound == 0.0 {
-                *end = 0.0;
-            }
-        }
-        out
-    }
-
-    fn inverse(self) -> Range {
-        if self.low > 0.0 || self.high < 0.0 { Range::around(&[1.0 / self.low, 1.0 / self.high]) } else { ALL }
-    }
-
-    fn power(self, power: i32) -> Range {
-        let base = if power < 0 { self.inverse() } else { self };
-        let n = power.unsigned_abs();
-        let size = |x: f64| (0..n).fold(1.0_f64, |product, _| product * x.abs());
-        let (low, high) = (size(base.low), size(base.high));
-        if n % 2 == 1 {
-            return Range::around(&[low.copysign(base.low), high.copysign(base.high)]).keep_zero(base);
-        }
-        let out = Range::around(&[low, high]);
-        Range { low: if base.low <= 0.0 && base.high >= 0.0 { 0.0 } else { out.low.max(0.0) }, high: out.high }
-    }
-
-    /// Restores ends that were exactly zero.
-    fn keep_zero(self, base: Range) -> Range {
-        Range {
-            low: if base.low == 0.0 { 0.0 } else { self.low },
-            high: if base.high == 0.0 { 0.0 } else { self.high },
-        }
-    }
-
-    fn hull(self, other: Range) -> Range {
-        Range { low: self.low.min(other.low), high: self.high.max(other.high) }
-    }
-
-    fn size(self) -> f64 {
-        self.low.abs().max(self.high.abs())
-    }
-
-    /// The image under an increasing function within `limits` whose values are accurate to a few last digits.
-    fn rising(self, f: impl Fn(f64) -> f64, limits: (f64, f64)) -> Range {
-        let off = |x: f64| 8.0 * f64::EPSILON * x.abs();
-        let (low, high) = (f(self.low), f(self.high));
-        if low.is_nan() || high.is_nan() {
-            return Range { low: limits.0, high: limits.1 };
-        }
-        Range { low: (low - off(low)).max(limits.0), high: (high + off(high)).min(limits.1) }
-            .keep_zero(Range { low, high })
-    }
+/// 1 / x; everything if x can be 0.
+fn inverse(x: Interval) -> Interval {
+    if x.has_zero() { Interval::ALL } else { x.reciprocal() }
 }
 
-#[expect(clippy::disallowed_methods, reason = "bounds of intervals with room for errors, not values of a run")]
-fn elementary(function: Unary, x: Range) -> Range {
-    let (all, unit) = ((f64::NEG_INFINITY, f64::INFINITY), Range { low: -1.0, high: 1.0 });
-    match function {
-        Unary::Exp => x.rising(f64::exp, (0.0, f64::INFINITY)),
-        Unary::Expm1 => x.rising(f64::exp_m1, (-1.0, f64::INFINITY)),
-        Unary::Log if x.low > 0.0 => x.rising(f64::ln, all),
-        Unary::Log1p if x.low > -1.0 => x.rising(f64::ln_1p, all),
-        Unary::Sin | Unary::Cos => unit,
-        Unary::Tanh => x.rising(f64::tanh, (-1.0, 1.0)),
-        Unary::Atan => x.rising(f64::atan, (-1.6, 1.6)),
-        Unary::Sinh => x.rising(f64::sinh, all),
-        Unary::Asin => Range { low: -1.6, high: 1.6 },
-        Unary::Acos => Range { low: 0.0, high: 3.2 },
-        Unary::Cosh => Range { low: 1.0, high: f64::INFINITY },
-        Unary::Log | Unary::Log1p | Unary::Tan => ALL,
-    }
-}
-
-#[expect(clippy::disallowed_methods, reason = "bounds of intervals with room for errors, not values of a run")]
-fn of_two(function: Binary, a: Range, b: Range) -> Range {
-    match function {
-        Binary::Pow if a.low >= 0.0 && b.low == b.high => {
-            let n = b.low;
-            let off = |x: f64| 16.0 * f64::EPSILON * x.abs();
-            let (p, q) = (a.low.powf(n), a.high.powf(n));
-            let out = Range::around(&[p - off(p), p + off(p), q - off(q), q + off(q)]);
-            Range { low: out.low.max(0.0), high: out.high }
-        }
-        Binary::Pow if a.low >= 0.0 => Range { low: 0.0, high: f64::INFINITY },
-        Binary::Hypot => Range { low: 0.0, high: f64::INFINITY },
-        Binary::Atan2 => Range { low: -3.2, high: 3.2 },
-        Binary::Pow => ALL,
-    }
+/// x^n
+fn power(x: Interval, n: i32) -> Interval {
+    let base = if n < 0 { inverse(x) } else { x };
+    base.power(n.unsigned_abs())
 }
 
 impl<'a> Bounds<'a> {
     fn new(func: &'a Func, live: &[bool], cell: &'a Cell, pool: &[f64], work: &'a mut usize) -> Bounds<'a> {
         let n = func.ops.len();
-        let mut ranges = vec![ALL; n];
+        let mut ranges = vec![Interval::ALL; n];
         let mut truths: Vec<Option<bool>> = vec![None; n];
         for (i, op) in func.ops.iter().enumerate().filter(|(i, _)| live[*i]) {
             let r = |value: Value| ranges[value.index()];
             let known = cell.facts.iter().find(|(value, _)| value.index() == i).map(|(_, truth)| *truth);
             let mut truth = None;
             let range = match *op {
-                Op::Real(bits) => Range::point(f64::from_bits(bits)),
-                Op::Load(slot) => cell.inputs.iter().find(|(at, _)| *at == slot).map_or(ALL, |(_, range)| *range),
+                Op::Real(bits) => Interval::point(f64::from_bits(bits)),
+                Op::Load(slot) => {
+                    cell.inputs.iter().find(|(at, _)| *at == slot).map_or(Interval::ALL, |(_, range)| *range)
+                }
                 Op::Pool { base, len, .. } => {
                     let entries = &pool[base as usize..(base + len) as usize];
-                    entries.iter().fold(Range::point(entries[0]), |all, x| all.hull(Range::point(*x)))
+                    entries.iter().fold(Interval::point(entries[0]), |all, x| all.hull(Interval::point(*x)))
                 }
-                Op::Add(a, b) => r(a).add(r(b)),
-                Op::Sub(a, b) => r(a).add(r(b).negate()),
-                Op::Mul(a, b) if a == b => r(a).power(2),
+                Op::Add(a, b) => r(a).plus(r(b)),
+                Op::Sub(a, b) => r(a).minus(r(b)),
+                Op::Mul(a, b) if a == b => r(a).square(),
                 Op::Mul(a, b) => r(a).multiply(r(b)),
-                Op::Fma(a, b, c) => r(a).multiply(r(b)).add(r(c)),
-                Op::Div(a, b) => r(a).multiply(r(b).inverse()),
+                Op::Fma(a, b, c) => r(a).multiply(r(b)).plus(r(c)),
+                Op::Div(a, b) => r(a).multiply(inverse(r(b))),
                 Op::Neg(a) => r(a).negate(),
-                Op::Abs(a) if r(a).low >= 0.0 => r(a),
-                Op::Abs(a) if r(a).high <= 0.0 => r(a).negate(),
-                Op::Abs(a) => Range { low: 0.0, high: r(a).size() },
-                Op::Sqrt(a) if r(a).low >= 0.0 => r(a).rising(f64::sqrt, (0.0, f64::INFINITY)),
-                Op::Unary(function, a) => elementary(function, r(a)),
-                Op::Binary(function, a, b) => of_two(function, r(a), r(b)),
+                Op::Abs(a) => r(a).abs(),
+                // Outside its domain a function is not a number.
+                Op::Sqrt(a) if r(a).is_not_negative() => r(a).sqrt(),
+                Op::Unary(function, a) if function.row().domain.holds(r(a)) => function.image(r(a)),
+                Op::Binary(function, a, b) => (function.row().image)(r(a), r(b)),
                 Op::Bool(b) => {
                     truth = Some(b);
-                    ALL
+                    Interval::ALL
                 }
                 Op::Less(a, b) => {
                     truth = (r(a).high < r(b).low).then_some(true).or((r(a).low >= r(b).high).then_some(false));
-                    ALL
+                    Interval::ALL
                 }
                 Op::LessEqual(a, b) => {
                     truth = (r(a).high <= r(b).low).then_some(true).or((r(a).low > r(b).high).then_some(false));
-                    ALL
+                    Interval::ALL
                 }
                 Op::Equal(a, b) => {
                     let (a, b) = (r(a), r(b));
                     truth = (a.low == a.high && a == b).then_some(true);
                     truth = truth.or((a.high < b.low || b.high < a.low).then_some(false));
-                    ALL
+                    Interval::ALL
                 }
                 Op::And(a, b) => {
                     truth = match (truths[a.index()], truths[b.index()]) {
@@ -316,7 +196,7 @@ impl<'a> Bounds<'a> {
                         (Some(true), Some(true)) => Some(true),
                         _ => None,
                     };
-                    ALL
+                    Interval::ALL
                 }
                 Op::Or(a, b) => {
                     truth = match (truths[a.index()], truths[b.index()]) {
@@ -324,11 +204,11 @@ impl<'a> Bounds<'a> {
                         (Some(false), Some(false)) => Some(false),
                         _ => None,
                     };
-                    ALL
+                    Interval::ALL
                 }
                 Op::Not(a) => {
                     truth = truths[a.index()].map(|truth| !truth);
-                    ALL
+                    Interval::ALL
                 }
                 Op::Select(condition, a, b) => match truths[condition.index()] {
                     Some(yes) => {
@@ -343,6 +223,7 @@ impl<'a> Bounds<'a> {
                 },
                 Op::Ring { .. }
                 | Op::Sqrt(_)
+                | Op::Unary(..)
                 | Op::Floor(_)
                 | Op::Nearest(_)
                 | Op::Int(_)
@@ -360,7 +241,7 @@ impl<'a> Bounds<'a> {
                 | Op::ToBits(_)
                 | Op::FromBits(_)
                 | Op::ToInt(_)
-                | Op::ToReal(_) => ALL,
+                | Op::ToReal(_) => Interval::ALL,
             };
             truths[i] = known.or(truth);
             ranges[i] = range;
@@ -397,7 +278,7 @@ impl<'a> Bounds<'a> {
             Op::Div(a, b) => {
                 let (above, below) = (self.sum(a), self.sum(b));
                 let range = self.ranges[b.index()];
-                let safe = range.low > 0.0 || range.high < 0.0;
+                let safe = !range.has_zero();
                 let inverse = match below.single() {
                     Some((product, x)) if safe => {
                         let turned: Product = product.iter().map(|(opaque, power)| (*opaque, -power)).collect();
@@ -407,7 +288,7 @@ impl<'a> Bounds<'a> {
                         // The divisor as a whole becomes opaque: its index with the top bit set, which no other opaque
                         // term has.
                         let key = b.0 | 1 << 31;
-                        self.inverse.insert(key, if safe { range.inverse() } else { ALL });
+                        self.inverse.insert(key, inverse(range));
                         Sum([(vec![(key, 1)], (1.0, 1.0))].into())
                     }
                 };
@@ -431,7 +312,7 @@ impl<'a> Bounds<'a> {
         (terms <= MOST_TERMS).then(|| a.times(&b))
     }
 
-    fn opaque(&self, key: u32) -> Range {
+    fn opaque(&self, key: u32) -> Interval {
         self.inverse.get(&key).copied().unwrap_or_else(|| self.ranges[key as usize])
     }
 
@@ -457,17 +338,17 @@ impl<'a> Bounds<'a> {
             });
         }
         common.retain(|opaque, power| *power % 2 == 0 || self.opaque(*opaque).low > 0.0);
-        let mut total = Range::point(0.0);
+        let mut total = Interval::point(0.0);
         let mut size = 0.0;
         for (product, (x, _)) in &sum.0 {
-            let mut range = Range::point(*x);
+            let mut range = Interval::point(*x);
             for (opaque, power) in product {
                 let power = power - common.get(opaque).copied().unwrap_or(0);
                 if power != 0 {
-                    range = range.multiply(self.opaque(*opaque).power(power));
+                    range = range.multiply(self::power(self.opaque(*opaque), power));
                 }
             }
-            total = total.add(range);
+            total = total.plus(range);
             size += range.size();
         }
         total.low >= -NOTHING * size && size.is_finite() || total.low >= 0.0
@@ -513,18 +394,14 @@ impl<'a> Bounds<'a> {
             let half = |low: bool| {
                 let mut cell = self.cell.clone();
                 let (_, range) = cell.inputs.iter_mut().find(|(input, _)| *input == slot)?;
-                if low {
-                    range.high = range.high.min(at);
-                } else {
-                    range.low = range.low.max(at);
-                }
+                *range = range.and(if low { Interval::to(at) } else { Interval::from(at) });
                 cell.depth += 1;
                 cell.facts.push((Value(i as u32), low == below));
                 Some(cell)
             };
             return Some([half(true)?, half(false)?]);
         }
-        let width = |range: &Range| match (range.low, range.high) {
+        let width = |range: &Interval| match (range.low, range.high) {
             (low, high) if low > 0.0 => (high / low).min(1e300) - 1.0,
             (low, high) if high < 0.0 => (low / high).min(1e300) - 1.0,
             // The ratio of the ends is meaningless across zero.
@@ -552,9 +429,9 @@ impl<'a> Bounds<'a> {
         };
         let inside = range.low < middle && middle < range.high;
         inside.then(|| {
-            [Range { high: middle, ..range }, Range { low: middle, ..range }].map(|range| {
+            [Interval::to(middle), Interval::from(middle)].map(|half| {
                 let mut cell = self.cell.clone();
-                cell.inputs[at].1 = range;
+                cell.inputs[at].1 = range.and(half);
                 cell.depth += 1;
                 cell
             })
@@ -562,15 +439,11 @@ impl<'a> Bounds<'a> {
     }
 }
 
-/// `if a < b then a else b` is at most both of them; `if b < a then a else b` is at least both.
-fn smaller_or_larger(func: &Func, condition: Value, a: Value, b: Value, x: Range, y: Range) -> Option<Range> {
+/// The interval of min(a, b) or max(a, b), if a selection computes one of them. `x` and `y`: the intervals of a and b.
+fn smaller_or_larger(func: &Func, condition: Value, a: Value, b: Value, x: Interval, y: Interval) -> Option<Interval> {
     match func.ops[condition.index()] {
-        Op::Less(p, q) | Op::LessEqual(p, q) if (p, q) == (a, b) => {
-            Some(Range { low: x.low.min(y.low), high: x.high.min(y.high) })
-        }
-        Op::Less(p, q) | Op::LessEqual(p, q) if (p, q) == (b, a) => {
-            Some(Range { low: x.low.max(y.low), high: x.high.max(y.high) })
-        }
+        Op::Less(p, q) | Op::LessEqual(p, q) if (p, q) == (a, b) => Some(x.min(y)),
+        Op::Less(p, q) | Op::LessEqual(p, q) if (p, q) == (b, a) => Some(x.max(y)),
         _ => None,
     }
 }
@@ -578,7 +451,10 @@ fn smaller_or_larger(func: &Func, condition: Value, a: Value, b: Value, x: Range
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::functions::{Binary, Unary};
+    use crate::interval::planted;
     use crate::ir::build::Build;
+    use crate::ir::random::Random;
 
     const X: Slot = Slot(0);
     const Y: Slot = Slot(1);
@@ -591,7 +467,7 @@ mod tests {
         build.store(Slot(2), value);
         let func = build.finish();
         let value = func.stores[0].1;
-        let inputs = [(X, Range { low: -1.0, high: 1.0 }), (Y, Range { low: 1e-3, high: 10.0 })];
+        let inputs = [(X, Interval::closed(-1.0, 1.0)), (Y, Interval::closed(1e-3, 10.0))];
         let claim = Claim { func: &func, any: &[value], unless: &[] };
         let mut work = 1_000_000;
         prove(&claim, &inputs, &[], &mut work)
@@ -681,10 +557,123 @@ mod tests {
         let stored = |slot: Slot| func.stores.iter().find(|(at, _)| *at == slot).expect("it is stored").1;
         let x = stored(Slot(3));
         let Op::Select(negative, ..) = func.ops[stored(Slot(2)).index()] else { panic!("a choice") };
-        let inputs = [(X, Range { low: -1.0, high: 1.0 })];
+        let inputs = [(X, Interval::closed(-1.0, 1.0))];
         for (unless, wanted) in [(vec![negative], true), (vec![], false)] {
             let claim = Claim { func: &func, any: &[x], unless: &unless };
             assert_eq!(prove(&claim, &inputs, &[], &mut 10_000), wanted);
+        }
+    }
+
+    /// A function of three inputs that stores the value of each operation, with elementary functions among them.
+    fn random_function(random: &mut Random) -> Func {
+        let mut build = Build::new("random");
+        let mut values: Vec<Value> = (0..3).map(|slot| build.load(Slot(slot))).collect();
+        for number in [0.0, 1.0, -2.5, 1e-3] {
+            values.push(build.real(number));
+        }
+        for _ in 0..10 {
+            let mut pick = || values[random.below(values.len())];
+            let (x, y, z) = (pick(), pick(), pick());
+            let value = match random.below(14) {
+                0 => build.add(x, y),
+                1 => build.sub(x, y),
+                2 => build.mul(x, y),
+                3 => build.mul(x, x),
+                4 => build.div(x, y),
+                5 => build.fma(x, y, z),
+                6 => build.neg(x),
+                7 => build.abs(x),
+                8 => build.sqrt(x),
+                9 => build.min(x, y),
+                10 => build.max(x, y),
+                11 => {
+                    let less = build.less(x, y);
+                    build.select(less, z, x)
+                }
+                12 => build.unary(Unary::ALL[random.below(Unary::ALL.len())], x),
+                _ => build.binary(Binary::ALL[random.below(Binary::ALL.len())], x, y),
+            };
+            values.push(value);
+        }
+        for (k, value) in values.into_iter().enumerate() {
+            build.store(Slot(3 + k as u32), value);
+        }
+        build.finish()
+    }
+
+    /// An end of a box: of either sign, and of any magnitude.
+    fn end(random: &mut Random) -> f64 {
+        let size = [0.0, 1e-300, 1e-40, 1e-3, 0.3, 1.0, 1.0, 7.3, 40.0, 1e6][random.below(10)];
+        random.within(-1.0, 1.0).signum() * size * [1.0, random.within(0.5, 1.0)][random.below(2)]
+    }
+
+    /// Every value that a function computes from a point of a box lies in its interval. Exempt are values that are not
+    /// finite, and those computed from them.
+    fn values_lie_in_their_intervals(functions: u64) {
+        let seed = std::env::var("FRIC_SEED").ok().and_then(|seed| seed.parse().ok()).unwrap_or(0xB0C5);
+        let (mut checked, mut bounded) = (0, 0);
+        for case in 0..functions {
+            let mut random = Random(seed + case);
+            let func = random_function(&mut random);
+            let ends: [[f64; 2]; 3] = std::array::from_fn(|_| [end(&mut random), end(&mut random)]);
+            let inputs: Vec<(Slot, Interval)> = (0..3)
+                .map(|k| {
+                    (
+                        Slot(k),
+                        Interval::closed(
+                            ends[k as usize][0].min(ends[k as usize][1]),
+                            ends[k as usize][0].max(ends[k as usize][1]),
+                        ),
+                    )
+                })
+                .collect();
+            let cell = Cell { inputs: inputs.clone(), facts: Vec::new(), depth: 0 };
+            let (live, mut work) = (func.live(), 0);
+            let ranges = Bounds::new(&func, &live, &cell, &[], &mut work).ranges;
+            let expanded = crate::math::expand(&func);
+            for _ in 0..8 {
+                let mut block = vec![0.0; 3 + func.stores.len()];
+                for (slot, range) in &inputs {
+                    let inside = random.within(0.0, 1.0);
+                    let x = [range.low, range.high, range.low + inside * (range.high - range.low)][random.below(3)];
+                    block[slot.index()] = x.clamp(range.low, range.high);
+                }
+                let at = block[..3].to_vec();
+                crate::ir::interpret::run_once(&expanded, &mut block, crate::math::pool());
+                let stored: HashMap<Value, f64> =
+                    func.stores.iter().map(|(slot, value)| (*value, block[slot.index()])).collect();
+                let mut finite = vec![true; func.ops.len()];
+                for (i, op) in func.ops.iter().enumerate() {
+                    let found = stored.get(&Value(i as u32)).copied();
+                    op.each_operand(|operand| finite[i] &= finite[operand.index()]);
+                    finite[i] &= found.is_none_or(f64::is_finite);
+                    let (Some(y), true) = (found, finite[i]) else { continue };
+                    let range = ranges[i];
+                    checked += 1;
+                    bounded += u32::from(range != Interval::ALL);
+                    assert!(
+                        y >= range.low && y <= range.high && y.abs() >= range.away,
+                        "seed {}: v{i} = {y:e} in {range:?} at {at:?}\n{func}",
+                        seed + case
+                    );
+                }
+            }
+        }
+        assert!(bounded * 2 > checked, "{bounded} of {checked} values have a bound");
+    }
+
+    #[test]
+    fn values_of_random_functions_lie_in_their_intervals() {
+        values_lie_in_their_intervals(4000);
+    }
+
+    #[test]
+    fn mistakes_in_interval_arithmetic_are_detected() {
+        for fault in ["ends do not round", "products are never too small", "tanh never reaches 1"] {
+            planted::plant(fault);
+            let found = std::panic::catch_unwind(|| values_lie_in_their_intervals(40_000));
+            planted::plant("");
+            assert!(found.is_err(), "{fault}");
         }
     }
 }
