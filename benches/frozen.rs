@@ -26,7 +26,7 @@ fn main() {
             let loaded = load(&name, &text, &project::Disk);
             let models: Vec<String> = loaded.models().iter().map(|model| model.name.text.clone()).collect();
             for model in models {
-                for method in [Method::Euler, Method::Rk4, Method::Expo, Method::Implicit, Method::Adaptive] {
+                for method in Method::ALL {
                     let hashes = match made(&name, &text, &model, method) {
                         Ok(all) => all.iter().map(|bytes| short(bytes)).collect::<Vec<_>>().join(" "),
                         Err(code) => code,

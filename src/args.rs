@@ -878,8 +878,7 @@ fn host(text: &str) -> Result<String, String> {
 }
 
 fn solver(text: &str) -> Result<Method, String> {
-    let names = || Method::ALL.map(Method::name).join(", ");
-    Method::named(text).ok_or_else(|| format!("the solvers are {}", names()))
+    Method::named(text).ok_or_else(|| format!("the solvers are {}", Method::list(Method::ALL)))
 }
 
 fn target(text: &str) -> Result<Target, String> {

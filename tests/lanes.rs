@@ -4,7 +4,7 @@
 mod support;
 
 use abi::description::Kind;
-use abi::plan::Method;
+use abi::plan::{Method, Steps};
 use compiler::experiment::vary::{Fitted, Varying};
 use compiler::ir::random::Random;
 use compiler::{Case, Changes, Options};
@@ -117,10 +117,10 @@ fn start_values_share_their_lanes() {
     for draw in 0..draws {
         let experiment = ["last", "measured", "regimes", "held", "sampled"][random.below(5)];
         let method = Method::ALL[random.below(Method::ALL.len())];
-        let solver = match method {
-            Method::Adaptive => None,
-            Method::Euler | Method::Rk4 => Some((method, 1e-4)),
-            Method::Expo | Method::Implicit => Some((method, [1e-3, 5e-4][random.below(2)])),
+        let solver = match method.row().steps {
+            Steps::Adaptive => None,
+            Steps::Explicit => Some((method, 1e-4)),
+            Steps::Relaxing => Some((method, [1e-3, 5e-4][random.below(2)])),
         };
         let (method, step) = solver.unzip();
         let plain = Changes { method, step, ..Changes::default() };

@@ -3,6 +3,7 @@
 
 #![allow(clippy::disallowed_methods, reason = "closed forms are the platform's")]
 
+use abi::plan::Method;
 use serde_json::Value;
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -286,7 +287,8 @@ fn halving_the_step_shows_the_order_of_every_method() {
         let found = folder.readings("hang", &format!("--solver {method} --step {step}")).unwrap();
         found.iter().zip(&exact).map(|(a, b)| (a - b).abs()).sum::<f64>()
     };
-    for (method, order) in [("euler", 1.0), ("rk4", 4.0), ("expo", 2.0), ("implicit", 2.0)] {
+    for method in Method::fixed() {
+        let (method, order) = (method.name(), f64::from(method.row().order));
         let found = (error(method, "4ms") / error(method, "2ms")).log2();
         println!("{method}: order {found:.3}");
         assert!((found - order).abs() < 0.2, "{method}: order {found}");

@@ -3,7 +3,7 @@
 
 use crate::description::Slot;
 use crate::rig::Bench;
-pub use crate::series::{Method, PARTS, Series, Solver};
+pub use crate::series::{Method, PARTS, Series, Solver, Steps};
 use crate::unit::Unit;
 use std::fmt;
 use std::sync::Arc;

@@ -9,7 +9,6 @@ use crate::rig::{
 use crate::{encode_enums, encode_structs};
 
 encode_enums! {
-    Method { Euler = 0, Rk4 = 1, Expo = 2, Implicit = 3, Adaptive = 4 }
     Mode { Torque = 0, Speed = 1, Position = 2 }
     Format { Unsigned = 0, Signed = 1, Float32 = 2, Float64 = 3 }
 }
@@ -33,6 +32,18 @@ encode_structs! {
     Output { signal, slot, low, high, slew, safe }
     Stop { slot, condition, why }
     Plant { applied, seen, inertia }
+}
+
+impl Encode for Method {
+    fn encode(&self, out: &mut Vec<u8>) {
+        out.push(self.row().code);
+    }
+
+    fn decode(reader: &mut Reader) -> Result<Method, Malformed> {
+        let code = u8::decode(reader)?;
+        let method = Method::ALL.into_iter().find(|method| method.row().code == code);
+        method.ok_or_else(|| Malformed(format!("{code} is no method")))
+    }
 }
 
 /// Encoded as an optional number of ticks: none for `stop`.

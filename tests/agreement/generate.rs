@@ -713,7 +713,7 @@ impl Writer {
             let value = if self.once_in(2) { self.signal(*unit) } else { self.real(&outside, *unit, 2) };
             args.push(format!("{input} = {value}"));
         }
-        let solver = ["euler", "rk4", "expo", "implicit"][self.below(4)];
+        let solver = Method::fixed().nth(self.below(Method::fixed().count())).expect("a fixed step").name();
         self.line(&format!(
             "experiment e {{\n  run    Top({}) for 1 s\n  solver {solver} step {step}",
             args.join(", ")

@@ -27,7 +27,7 @@ use compiler::ir::random::{self, Random};
 use compiler::ir::{Func, Op, Value};
 use report::Distribution;
 use std::path::Path;
-use texts::{FIXED, Fallen};
+use texts::Fallen;
 
 /// Random programs in a plain run, of all kinds together.
 const PLAIN: u64 = 2000;
@@ -66,8 +66,8 @@ fn from_the_grammar(seed: u64) -> Result<Made, Fallen> {
     let (text, step) = (&generated.text, generated.step);
     let mut random = Random(!seed);
     let name = format!("text from the grammar, seed {seed}");
-    let fixed = FIXED[seed as usize % FIXED.len()];
-    let methods = [Some(fixed), (seed % 4 == 1).then_some(Method::Adaptive)];
+    let fixed = Method::fixed().cycle().nth(seed as usize % Method::fixed().count());
+    let methods = [fixed, (seed % 4 == 1).then_some(Method::Adaptive)];
     let mut cases = Vec::new();
     for method in methods.into_iter().flatten() {
         let program = match random.below(2) {
@@ -150,7 +150,7 @@ fn seeds_of_changed_texts_agree() {
 #[test]
 fn models_of_the_library_agree() {
     let mut cases: Vec<Case> = Vec::new();
-    let mut methods = FIXED.into_iter().cycle();
+    let mut methods = Method::fixed().cycle();
     let mut seen = std::collections::HashSet::new();
     for (name, text) in library() {
         let loaded = compiler::load(&name, &text, &support::Texts::default());

@@ -3,7 +3,7 @@
 //! as a program.
 
 use crate::campaign::Made;
-use crate::texts::{self, FIXED, Fallen};
+use crate::texts::{self, Fallen};
 use abi::plan::Method;
 use compiler::functions::{Builtin, Units};
 use compiler::ir::program::Program;
@@ -77,7 +77,7 @@ pub fn mutant(seed: u64) -> Result<Made, Fallen> {
     let experiment = &original.experiments[random.below(original.experiments.len())];
     let (text, ways) = original.changed(experiment, &mut random);
     let experiment = &experiment.name;
-    let method = FIXED.into_iter().chain([Method::Adaptive]).nth(seed as usize % 5).expect("five methods");
+    let method = Method::ALL[seed as usize % Method::ALL.len()];
     let (variants, step) =
         texts::read(&original.name, &text, experiment, method).map_err(|found| texts::fallen(&found))?;
     let which = random.below(variants.len());

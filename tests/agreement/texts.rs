@@ -10,9 +10,6 @@ use compiler::ir::random::Random;
 use grammar::ast::{ExperimentStatement, Item, Solver};
 use grammar::diagnostic::Diagnostic;
 
-/// The fixed methods, in turn.
-pub const FIXED: [Method; 4] = [Method::Euler, Method::Rk4, Method::Expo, Method::Implicit];
-
 /// Programs with more operations in all functions are skipped: gcc takes minutes for them, and they show nothing new.
 const MOST_OPERATIONS: usize = 5_000;
 

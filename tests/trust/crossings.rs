@@ -2,12 +2,13 @@
 
 use crate::chance::{Chance, seeds};
 use crate::support::{Texts, checked};
+use abi::plan::Method;
 use compiler::{Changes, Options};
 
 /// A signal that is random in every step, and counters of its crossings.
 fn text(seed: u64) -> String {
     let mut chance = Chance::new(seed);
-    let method = chance.of(&["euler", "rk4", "expo", "implicit"]);
+    let method = chance.of(&Method::fixed().collect::<Vec<_>>()).name();
     let number = |chance: &mut Chance| format!("{:.2}", chance.within(-0.4, 0.4));
     let (level, more) = (number(&mut chance), number(&mut chance));
     let drawn = chance.of(&["random(7, k) - 0.5", "floor(3 * random(7, k)) - 1", "0.5 * sin(k) + 0.1"]);

@@ -7,6 +7,7 @@
 use crate::chance::{Chance, seeds};
 use crate::support::{Texts, checked, root, texts_below};
 use abi::Instance;
+use abi::plan::{Method, Steps};
 use compiler::{Changes, Options};
 use std::borrow::Cow;
 
@@ -174,7 +175,10 @@ const WITHIN: &[&str] = &[
     "SineProfile",
     "TanhSign",
 ];
-const METHODS: [&str; 3] = ["expo", "implicit", "rk4"];
+/// The methods that are compared with Euler's.
+fn methods() -> impl Iterator<Item = Method> + Clone {
+    Method::fixed().filter(|method| *method != Method::Euler)
+}
 /// Largest error of a single run across a jump, as a multiple of Euler's.
 const WORST: f64 = 10.0;
 const STEPS: [f64; 4] = [1e-4, 5e-4, 1e-3, 2e-3];
@@ -272,28 +276,25 @@ fn size(a: &[f64]) -> f64 {
 }
 
 /// The greatest errors of Euler's method and of the others, and the range of the quantity.
-fn errors(case: &Case) -> Result<(f64, [f64; 3], f64), String> {
+fn errors(case: &Case) -> Result<(f64, Vec<f64>, f64), String> {
     let reference = course(case, "rk4", 100)?;
     let error = |method: &str| course(case, method, 1).map(|course| distance(&course, &reference));
-    let mut all = [0.0; 3];
-    for (one, method) in all.iter_mut().zip(METHODS) {
-        *one = error(method)?;
-    }
+    let all = methods().map(|method| error(method.name())).collect::<Result<Vec<f64>, String>>()?;
     Ok((error("euler")?, all, size(&reference)))
 }
 
 /// The failures of the methods in a case.
-fn judge(euler: f64, all: &[f64; 3], range: f64) -> Vec<String> {
+fn judge(euler: f64, all: &[f64], range: f64) -> Vec<String> {
     let mut wrong = Vec::new();
-    for (method, error) in METHODS.iter().zip(all) {
-        // Where Euler's is beyond the stability of explicit methods, rk4 may be too. A run that was stopped has
+    for (method, error) in methods().zip(all) {
+        // Where Euler's is beyond the stability of explicit methods, another one may be too. A run that was stopped has
         // reported it: `z` of LuGre left its range, `s` of BristleMass is not a number. At σ0 |v| h/g > 2.8 rk4 is
         // unstable for the bristle; Euler's method is from 2 on, but stays bounded where a deflection in the steady
         // state has exactly the rate 0, or where an oscillating tip sticks in between.
-        let beyond = *method == "rk4" && (euler > range || error.is_infinite());
+        let beyond = method.row().steps == Steps::Explicit && (euler > range || error.is_infinite());
         // Below 1e-15 in SI is rounding.
         if !beyond && *error > 1.02 * euler + 1e-7 * range + 1e-15 {
-            wrong.push(format!("{method} {error:.3e}, euler {euler:.3e} of {range:.3e}"));
+            wrong.push(format!("{} {error:.3e}, euler {euler:.3e} of {range:.3e}", method.name()));
         }
     }
     wrong
@@ -346,20 +347,20 @@ fn under_a_mass_no_method_is_less_accurate_than_euler_on_average() {
     let benches: Vec<Bench> = benches().into_iter().filter(|bench| bench.jumps).collect();
     let seeds = seeds(benches.len() as u64);
     println!("seeds {seeds:?}");
-    let (mut failed, mut sums, mut counts) = (Vec::new(), [0.0; 3], [0; 3]);
+    let (mut failed, mut sums, mut counts) = (Vec::new(), vec![0.0; methods().count()], vec![0; methods().count()]);
     for seed in seeds {
         let case = Case::of(seed, &benches);
         let (euler, all, range) = errors(&case).unwrap_or_else(|words| panic!("seed {seed}: {words}"));
         if euler > 0.25 * range {
             continue;
         }
-        for (k, error) in all.iter().enumerate() {
-            if METHODS[k] == "implicit" && case.run.contains("BreakAwayTanh") {
+        for (k, (method, error)) in methods().zip(&all).enumerate() {
+            if method == Method::Implicit && case.run.contains("BreakAwayTanh") {
                 continue;
             }
             // As above: the run reports which range was left, and `check` up to which speed the step is stable (W0704).
-            if METHODS[k] == "rk4" && error.is_infinite() {
-                println!("seed {seed}, step {:e} s, {}: rk4 leaves a range", case.step, case.run);
+            if method.row().steps == Steps::Explicit && error.is_infinite() {
+                println!("seed {seed}, step {:e} s, {}: {} leaves a range", case.step, case.run, method.name());
                 continue;
             }
             let ratio = (error + 1e-6 * range) / (euler + 1e-6 * range);
@@ -369,14 +370,15 @@ fn under_a_mass_no_method_is_less_accurate_than_euler_on_average() {
                 let (step, run) = (case.step, &case.run);
                 failed.push(format!(
                     "seed {seed}, step {step:e} s, {run}: {} {error:.3e}, euler {euler:.3e}",
-                    METHODS[k]
+                    method.name()
                 ));
             }
         }
     }
-    let means: Vec<f64> = sums.iter().zip(counts).map(|(sum, count)| (sum / f64::from(count)).exp()).collect();
-    println!("{counts:?} runs, mean error over Euler's: {METHODS:?} {means:.3?}");
-    assert!(means.iter().all(|mean| *mean < 1.0), "{METHODS:?} {means:?}");
+    let means: Vec<f64> = sums.iter().zip(&counts).map(|(sum, count)| (sum / f64::from(*count)).exp()).collect();
+    let names: Vec<&str> = methods().map(Method::name).collect();
+    println!("{counts:?} runs, mean error over Euler's: {names:?} {means:.3?}");
+    assert!(means.iter().all(|mean| *mean < 1.0), "{names:?} {means:?}");
     assert!(failed.is_empty(), "{} fail:\n{}", failed.len(), failed.join("\n"));
 }
 

@@ -114,7 +114,7 @@ pub fn explain(system: &System, types: &Types, files: &Files) -> Explanation {
     let Lowered { mut program, .. } = lower(system, types, &[]);
     program.size_rings(EXAMPLE_STEP);
     let bench = Bench::new(&program, &[]);
-    let steps = [Method::Euler, Method::Rk4, Method::Expo, Method::Implicit].map(|method| {
+    let steps = Method::fixed().map(|method| {
         let step = fixed_step::step(&program, method);
         let expanded = crate::math::expand(&step);
         let divisions = expanded.ops.iter().filter(|op| matches!(op, Op::Div(..) | Op::Sqrt(_))).count();
@@ -133,7 +133,7 @@ pub fn explain(system: &System, types: &Types, files: &Files) -> Explanation {
         equations: equations(system, files),
         needs: needs(system),
         states: states(system, &program),
-        steps: steps.to_vec(),
+        steps: steps.collect(),
         bytes: 8 * program.description.layout.size(),
         storage: system.storages.iter().map(|(_, energy)| one_line(files, system.span(*energy))).collect(),
         rate_independent: rate_independent(system),

@@ -13,7 +13,7 @@ use crate::frontend::units::Types;
 use crate::ir::program::Program;
 use crate::numerics::fixed_step;
 use abi::Slot;
-use abi::plan::Method;
+use abi::plan::{Method, Steps};
 use abi::unit::Unit;
 use grammar::ast::BinaryOp;
 use grammar::diagnostic::Diagnostic;
@@ -95,7 +95,7 @@ impl Fixed<'_> {
         let var = system.var(id);
         let (method, step) = (self.method.name(), time(self.step));
         let own = states(system, self.program).into_iter().find(|state| state.path == var.path).map(|state| state.own);
-        let linear = own == Some(Own::Affine) && matches!(self.method, Method::Euler | Method::Rk4);
+        let linear = own == Some(Own::Affine) && self.method.row().steps == Steps::Explicit;
         let stiff = unstable.rate * self.step > 1.0;
         let place = match system.instance(var.instance).path.is_empty() {
             true => self.run,

@@ -62,7 +62,7 @@ pub fn lanes(program: &Program, method: Method) -> Option<Lanes> {
     let vectors = |width: Width| match (method, width) {
         (Method::Adaptive, Width::Pairs | Width::Avx512) => 2,
         (Method::Adaptive, Width::Avx | Width::Avx2) => 3,
-        (Method::Euler | Method::Rk4 | Method::Expo | Method::Implicit, _) => width.vectors(),
+        _ => width.vectors(),
     };
     Width::here_all().find_map(|width| lanes_of(program, method, width, vectors(width)))
 }

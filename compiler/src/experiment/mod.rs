@@ -888,10 +888,9 @@ impl Reader<'_> {
         let written = parts.solver.and_then(|solver| {
             let method = Method::named(&solver.method.text);
             if method.is_none() {
-                let names: Vec<&str> = Method::ALL.iter().map(|method| method.name()).collect();
                 let error = Diagnostic::error("E0201", format!("there is no solver `{}`", solver.method.text))
                     .label(solver.method.span, "not known");
-                self.diagnostics.push(error.help(format!("solvers are {}", names.join(", "))));
+                self.diagnostics.push(error.help(format!("solvers are {}", Method::list(Method::ALL))));
             }
             method
         });

@@ -158,16 +158,15 @@ impl Reader<'_, '_> {
             Some(Method::Adaptive) => {
                 let error = Diagnostic::error("E0905", "a rig takes steps of fixed length")
                     .label(solver.method.span, "takes as many as it needs");
-                self.report(
-                    error.help("write `solver expo`, `implicit`, `rk4` or `euler`, or leave it out for `expo`"),
-                );
+                let methods = Method::list(Method::fixed());
+                self.report(error.help(format!("write `solver` and one of {methods}, or leave it out for expo")));
                 Method::Expo
             }
             Some(method) => method,
             None => {
                 let error = Diagnostic::error("E0201", format!("there is no solver `{}`", solver.method.text))
                     .label(solver.method.span, "not known");
-                self.report(error.help("solvers of a rig are expo, implicit, rk4, euler"));
+                self.report(error.help(format!("solvers of a rig are {}", Method::list(Method::fixed()))));
                 Method::Expo
             }
         }

@@ -116,16 +116,14 @@ fn accompanied<'a>(
 /// The solvers of the companions of a run by the same method, in order of accuracy; coarser ones where no finer one is
 /// possible.
 fn finer(solver: &Solver) -> Vec<Solver> {
-    match solver.method {
-        Method::Adaptive => {
+    match solver.method.is_fixed() {
+        false => {
             let finer = |part: f64| Solver { tol: part * solver.tol, parts: 2.0 * solver.parts, ..*solver };
             let all: Vec<Solver> =
                 TOLERANCES.map(finer).into_iter().filter(|finer| finer.tol >= 0.999 * LEAST_TOL).collect();
             if all.is_empty() { vec![Solver { tol: 10.0 * solver.tol, ..*solver }] } else { all }
         }
-        Method::Euler | Method::Rk4 | Method::Expo | Method::Implicit => {
-            STEPS.map(|part| Solver { step: part * solver.step, ..*solver }).to_vec()
-        }
+        true => STEPS.map(|part| Solver { step: part * solver.step, ..*solver }).to_vec(),
     }
 }
 
@@ -255,14 +253,14 @@ impl Companions<'_> {
         let excess = excess.fold(if self.adaptive.is_some() { 1.0 } else { 4.0 }, f64::max);
         let safeties: &[f64] = if self.adaptive.is_some() { &[1.0, 4.0, 64.0] } else { &[4.0, 64.0] };
         for safety in safeties {
-            let solver = match own.method {
-                Method::Adaptive => {
+            let solver = match own.method.is_fixed() {
+                false => {
                     let tol = power_of_ten_below(own.tol / (safety * excess));
                     Solver { tol, parts: 2.0 * own.parts, ..own }
                 }
-                Method::Euler | Method::Rk4 | Method::Expo | Method::Implicit => {
+                true => {
                     let mut part = 0.5;
-                    while power(1.0 / part, order(own.method).min(2)) < safety * excess {
+                    while power(1.0 / part, own.method.row().order.min(2)) < safety * excess {
                         part *= 0.5;
                         if part < 1e-6 {
                             return None;
@@ -333,7 +331,7 @@ fn error(method: Method, values: &[f64]) -> f64 {
         (_, [coarse, fine, finest, ..]) => {
             let (first, second) = (coarse - fine, fine - finest);
             // 2^p, if the steps are short enough to show the order p.
-            let ratio = (first / second).clamp(2.0, power(2.0, order(method)));
+            let ratio = (first / second).clamp(2.0, power(2.0, method.row().order));
             let ratio = if ratio.is_nan() { 2.0 } else { ratio };
             let limit = finest - second / (ratio - 1.0);
             span.max((coarse - limit).abs())
@@ -352,15 +350,6 @@ fn compared(method: Method, values: &[f64]) -> f64 {
         return span;
     }
     error(method, &values[..values.len() - 2]).min(span)
-}
-
-/// The order of a fixed-step method.
-fn order(method: Method) -> u32 {
-    match method {
-        Method::Euler => 1,
-        Method::Rk4 => 4,
-        Method::Expo | Method::Implicit | Method::Adaptive => 2,
-    }
 }
 
 fn power(base: f64, exponent: u32) -> f64 {

@@ -19,7 +19,7 @@ pub use crate::run::outcome::{Cause, Continue, Estimate, Failure, Final, Outcome
 use crate::run::stepper::{self, Rest, Stepper};
 use crate::solver::adaptive::Adaptive;
 use abi::description::Kind;
-use abi::plan::{Experiment, Method};
+use abi::plan::Experiment;
 use abi::{Instance, Slot};
 
 /// Runs an experiment on an instance whose parameters and inputs are set.
@@ -116,11 +116,9 @@ pub(crate) fn start(
     observer: Observer,
     begin: &mut dyn FnMut(&mut Instance),
 ) -> Result<Box<dyn Stepper>, Box<(Rest, Stop)>> {
-    match experiment.solver.method {
-        Method::Euler | Method::Rk4 | Method::Expo | Method::Implicit => {
-            Ok(Box::new(Fixed::start(instance, experiment, observer, begin)?))
-        }
-        Method::Adaptive => Ok(Box::new(Adaptive::start(instance, experiment, observer, begin)?)),
+    match experiment.solver.method.is_fixed() {
+        true => Ok(Box::new(Fixed::start(instance, experiment, observer, begin)?)),
+        false => Ok(Box::new(Adaptive::start(instance, experiment, observer, begin)?)),
     }
 }
 

@@ -84,7 +84,7 @@ impl Crossed {
                     [row.label.clone(), differs, "-".into(), "-".into(), own, other]
                 }
                 false => {
-                    let at = runtime::format::time(row.time);
+                    let at = abi::format::time(row.time);
                     let largest = format!("{} at {at}", show(row.largest, &row.unit, 3));
                     [row.label.clone(), largest, part(row.largest), part(row.rms), own, other]
                 }
@@ -141,9 +141,9 @@ pub fn cross(
         changes: Changes { method: Some(method), step, tol: None, ..options.changes.clone() },
         ..options.clone()
     };
-    let partner = match own.method {
-        Method::Adaptive => changed(Method::Expo, Some(1e-4)),
-        Method::Euler | Method::Rk4 | Method::Expo | Method::Implicit => {
+    let partner = match own.method.is_fixed() {
+        false => changed(Method::Expo, Some(1e-4)),
+        true => {
             let mut partner = changed(Method::Adaptive, None);
             partner.changes.tol = Some(1e-8);
             partner
@@ -157,13 +157,13 @@ pub fn cross(
         }
     };
     // Steps are judged against a run whose own error is negligible.
-    let sharp = match own.method {
-        Method::Adaptive => {
+    let sharp = match own.method.is_fixed() {
+        false => {
             let mut sharp = options.clone();
             sharp.changes.tol = Some((0.01 * own.tol).max(1e-11));
             compile::compile(loaded, &project::Disk, name, &sharp, &mut Vec::new(), &mut |_| ()).ok()
         }
-        Method::Euler | Method::Rk4 | Method::Expo | Method::Implicit => None,
+        true => None,
     };
     let mut all = Vec::new();
     for (k, (case, other)) in cases.iter().zip(&partners).enumerate() {
@@ -282,13 +282,9 @@ fn worst(rows: &[Row]) -> f64 {
 /// A sufficient fixed step: extrapolated by the order of the method, verified, and halved until it is accurate enough.
 fn advice(fixed: &Experiment, error: f64, tried: &mut dyn FnMut(f64) -> Option<f64>) -> String {
     let Solver { method, step, .. } = fixed.solver;
-    let roots = match method {
-        Method::Euler => 0,
-        Method::Rk4 => 2,
-        Method::Expo | Method::Implicit | Method::Adaptive => 1,
-    };
+    // The root of the order, which is 1, 2 or 4; an order between those gets a shorter step.
     let mut part = GOAL / error.max(1e-12);
-    (0..roots).for_each(|_| part = part.sqrt());
+    (0..method.row().order.ilog2()).for_each(|_| part = part.sqrt());
     let name = method.name();
     let goal = format!("{} % of the range", significant(100.0 * GOAL, 1));
     let mut next = if part.is_finite() { round_down(step * part.clamp(1e-4, 20.0)) } else { round_down(0.2 * step) };
