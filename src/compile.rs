@@ -10,7 +10,6 @@ pub use compiler::analysis::dissipation::Verdict;
 pub use compiler::analysis::explain::{Explanation, Listed, StepCost};
 pub use compiler::analysis::linearise::{Linear, Matrices, Ports};
 pub use compiler::analysis::step_stability::LONGEST as LONGEST_STEP;
-pub use compiler::analysis::step_stability_report::two_digits_time;
 pub use compiler::codegen::elementary::Alone;
 use compiler::codegen::lanes;
 use compiler::codegen::target::{self, FunctionCompiler};
@@ -112,7 +111,7 @@ fn passes(built: &Built, method: Method) -> String {
     out += &format!("{:<18} {:>6} {:>6} {:>9}\n", "pass", "before", "after", "time");
     let mut begin = Instant::now();
     compiler::codegen::passes::each(&built.program, method, &mut |ran| {
-        let time = crate::quantity::duration(begin.elapsed().as_secs_f64());
+        let time = crate::quantity::duration(begin.elapsed().as_secs_f64(), 3);
         let [before, after] = ran.ops;
         out += &format!("{:<18} {before:>6} {after:>6} {time:>9}  {}", ran.name, ran.does);
         out += &ran.effect.map_or("\n".into(), |effect| format!(": {effect}\n"));

@@ -242,7 +242,7 @@ fn words(verdict: &Verdict, estimate: Option<&Estimate>, digits: Option<u8>) -> 
     }
     let distance = if verdict.holds { format!("margin {amount}") } else { format!("misses by {amount}") };
     let time = match margin.time {
-        Some(time) if !verdict.holds => format!(", at {}", runtime::format::time(time)),
+        Some(time) if !verdict.holds => format!(", at {}", abi::format::time(time)),
         Some(_) | None => String::new(),
     };
     format!("{value}, {distance}{time}")
@@ -258,7 +258,7 @@ fn readings_in(verdict: &Verdict, shown: &dyn Fn(f64, Option<f64>, &Unit) -> Str
 pub fn solver(solver: &Solver) -> String {
     match solver.method {
         Method::Adaptive => format!("adaptive tol {}", significant(solver.tol, 3)),
-        method => format!("{} step {}", method.name(), duration(solver.step)),
+        method => format!("{} step {}", method.name(), duration(solver.step, 3)),
     }
 }
 
@@ -274,13 +274,13 @@ pub fn compiled(description: &Description, experiment: &Experiment, stages: &Sta
     let second = Unit::parse("s").expect("the second is known");
     let solver = solver(&experiment.solver);
     let slowest: Vec<String> =
-        stages.0.iter().map(|(stage, seconds)| format!("{stage} {}", duration(*seconds))).collect();
+        stages.0.iter().map(|(stage, seconds)| format!("{stage} {}", duration(*seconds, 3))).collect();
     format!(
         "  {}: {}{of_cases}; {solver} for {}\n  compiled in {}: {}\n",
         description.name,
         facts.join(", "),
         show(experiment.duration, &second, 6),
-        duration(stages.total()),
+        duration(stages.total(), 3),
         slowest.join(", ")
     )
 }
@@ -298,10 +298,10 @@ pub fn work(experiment: &Experiment, outcomes: &[&Outcome], wall: f64, judging: 
         None | Some([]) => String::new(),
         Some(all) => {
             let kind = if experiment.solver.method == Method::Adaptive { "errors" } else { "discretisation" };
-            format!("; {kind} by {} in {}", finer(experiment, all), duration(judging))
+            format!("; {kind} by {} in {}", finer(experiment, all), duration(judging, 3))
         }
     };
-    format!("  ran {} steps in {}{speed}{errors}\n", count(steps), duration(wall))
+    format!("  ran {} steps in {}{speed}{errors}\n", count(steps), duration(wall, 3))
 }
 
 /// The companions of a run in words: `tol 1e-7 and 1e-8`.
@@ -309,7 +309,7 @@ pub fn finer(experiment: &Experiment, companions: &[Solver]) -> String {
     let adaptive = |finer: &&Solver| finer.method == Method::Adaptive;
     let joined = |all: Vec<String>| all.join(" and ");
     let tols = joined(companions.iter().filter(adaptive).map(|finer| significant(finer.tol, 3)).collect());
-    let steps = companions.iter().filter(|finer| !adaptive(finer)).map(|finer| duration(finer.step));
+    let steps = companions.iter().filter(|finer| !adaptive(finer)).map(|finer| duration(finer.step, 3));
     let steps = joined(steps.collect());
     let kind = if experiment.solver.method == Method::Adaptive { "tol" } else { "adaptive runs, tol" };
     match (tols.is_empty(), steps.is_empty()) {

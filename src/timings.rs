@@ -52,7 +52,7 @@ impl Timings {
         let meanwhile = self.meanwhile.0.iter().map(|(stage, seconds)| (*stage, *seconds, "  in a thread of its own"));
         let ends = [("other", rest, ""), ("together", whole, "")];
         let line = |(stage, seconds, note): (&str, f64, &str)| {
-            let words = duration(seconds);
+            let words = duration(seconds, 3);
             let (number, unit) = words.split_once(' ').unwrap_or((&words, ""));
             format!("  {stage:<12} {number:>7} {unit:<3}{note}").trim_end().to_string() + "\n"
         };

@@ -6,6 +6,7 @@
 
 pub mod random;
 pub mod unit;
+pub mod format;
 pub mod foreign;
 pub mod description;
 pub mod rosenbrock;

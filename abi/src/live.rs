@@ -8,7 +8,8 @@
 use crate::description::{Slot, TINY};
 use crate::encode::{Encode, Malformed, Reader};
 use crate::encode_structs;
-use crate::unit::{Unit, three_digits};
+use crate::format::{duration, quantity, three_digits};
+use crate::unit::Unit;
 
 /// The parameters of a rig and the conditions on them.
 #[derive(Clone, PartialEq, Debug, Default)]
@@ -217,7 +218,7 @@ pub fn is_empty(low: Option<(f64, bool)>, high: Option<(f64, bool)>) -> bool {
 
 /// E0502: the message for a value outside of its range.
 pub fn beyond_words(name: &str, model: &str, unit: &Unit, value: f64, beyond: Beyond) -> String {
-    let (bound, value) = (shown(beyond.bound, unit), shown(value, unit));
+    let (bound, value) = (quantity(beyond.bound, unit, 3), quantity(value, unit, 3));
     format!("`{name}` of {model} must be {} {bound}, not {value}", beyond.word)
 }
 
@@ -242,19 +243,12 @@ pub fn is_multiple(period: f64, step: f64) -> bool {
 
 /// E0701: the message for a period that is not an integer number of steps.
 pub fn no_multiple(period: f64, step: f64) -> String {
-    let second = Unit::parse("s").expect("the second is known");
-    format!("a period of {} is no multiple of the step of {}", shown(period, &second), shown(step, &second))
+    format!("a period of {} is no multiple of the step of {}", duration(period, 3), duration(step, 3))
 }
 
 /// E0802: the message for a command that its field cannot carry.
 pub fn cannot_be(path: &str, unit: &Unit, value: f64) -> String {
     format!("`{path}` cannot be {}", three_digits(unit.from_si(value)))
-}
-
-/// A value in SI with three digits, in a unit.
-pub fn shown(si: f64, unit: &Unit) -> String {
-    let number = three_digits(unit.from_si(si));
-    if unit.text.is_empty() { number } else { format!("{number} {unit}") }
 }
 
 impl Live {

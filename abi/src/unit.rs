@@ -531,26 +531,6 @@ pub fn quantity(text: &str) -> Result<(f64, Unit), NoQuantity> {
     Ok((number, unit))
 }
 
-/// Formats a number with three digits, for messages.
-pub fn three_digits(x: f64) -> String {
-    if x == 0.0 || !x.is_finite() {
-        return format!("{x}");
-    }
-    // The exponent of the scientific notation.
-    let scientific = format!("{x:e}");
-    let exponent: i32 = scientific.split_once('e').and_then(|(_, e)| e.parse().ok()).unwrap_or(0);
-    if !(-4..6).contains(&exponent) {
-        let text = format!("{x:.2e}");
-        let (mantissa, exponent) = text.split_once('e').expect("scientific form has an exponent");
-        let mantissa =
-            if mantissa.contains('.') { mantissa.trim_end_matches('0').trim_end_matches('.') } else { mantissa };
-        return format!("{mantissa}e{exponent}");
-    }
-    let decimals = (2 - exponent).max(0) as usize;
-    let text = format!("{x:.decimals$}");
-    if text.contains('.') { text.trim_end_matches('0').trim_end_matches('.').to_string() } else { text }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;

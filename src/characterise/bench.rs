@@ -28,7 +28,7 @@ impl Ran {
         match &self.result {
             Ok(outcome) => Ok(outcome.recording.rows().map(<[f64]>::to_vec).collect()),
             Err(failure) if failure.cause == Cause::Stopped => {
-                Err(format!("takes too many steps: given up at {}", runtime::format::time(failure.time)))
+                Err(format!("takes too many steps: given up at {}", abi::format::time(failure.time)))
             }
             Err(failure) => Err(failure.to_string()),
         }

@@ -2,7 +2,7 @@
 
 use crate::plot::{Band, raised};
 use crate::quantity::{show, significant};
-use abi::unit::Unit;
+pub use abi::format::prefixed;
 
 /// One test of the battery.
 #[derive(Clone, Debug)]
@@ -131,24 +131,6 @@ impl Line {
     /// The same curve, omitted when several models share the axes.
     pub fn aside(self) -> Line {
         Line { main: false, ..self }
-    }
-}
-
-/// A unit with a prefix for a magnitude, and its scale in SI.
-pub fn prefixed(base: &str, size: f64) -> (Unit, f64) {
-    const PREFIXES: [(&str, f64); 6] = [("G", 1e9), ("M", 1e6), ("k", 1e3), ("", 1.0), ("m", 1e-3), ("u", 1e-6)];
-    let plain = || (Unit::parse(base).unwrap_or_else(|_| Unit::none()), 1.0);
-    if base.is_empty() || base == "Hz" || base.starts_with("kg") || size == 0.0 || !size.is_finite() {
-        return plain();
-    }
-    if (0.1..1e4).contains(&size) || base == "s" && size >= 0.1 {
-        return plain();
-    }
-    // Slightly below the next prefix: 0.997 mm rather than 997 µm.
-    let fitting = PREFIXES.into_iter().find(|(_, scale)| size >= 0.9 * scale).unwrap_or(("n", 1e-9));
-    match Unit::parse(&format!("{}{base}", fitting.0)) {
-        Ok(unit) => (unit, fitting.1),
-        Err(_) => plain(),
     }
 }
 

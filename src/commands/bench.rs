@@ -108,7 +108,7 @@ fn tell(
     terminal: &mut Terminal,
 ) {
     let rate = |per_second: f64| format!("{} million steps a second", significant(1e-6 * per_second, 3));
-    terminal.line(&format!("{}, {} of {}", args.experiment, solver.method.name(), duration(solver.step)));
+    terminal.line(&format!("{}, {} of {}", args.experiment, solver.method.name(), duration(solver.step, 3)));
     terminal.line(&format!(
         "  a step: {} operations, {} bytes, longest chain about {} cycles",
         count(step.operations as u64),
@@ -128,8 +128,9 @@ fn tell(
         (None, Ok(_)) => {}
     }
     terminal.line(&format!("  all {cores} cores: {}", rate(everywhere)));
-    let parts: Vec<String> = stages.0.iter().map(|(name, seconds)| format!("{name} {}", duration(*seconds))).collect();
-    terminal.line(&format!("  compiled in {}: {}", duration(stages.total()), parts.join(", ")));
+    let parts: Vec<String> =
+        stages.0.iter().map(|(name, seconds)| format!("{name} {}", duration(*seconds, 3))).collect();
+    terminal.line(&format!("  compiled in {}: {}", duration(stages.total(), 3), parts.join(", ")));
 }
 
 /// The median over rounds of the result of `round`, in seconds per step of one instance.

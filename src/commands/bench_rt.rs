@@ -127,7 +127,7 @@ fn histogram(lateness: &Histogram) -> String {
     let line = |(upper_ns, count): &(u64, u64)| {
         // A single cycle in a million is still visible.
         let bar = "━".repeat((BAR * *count as f64 / most).ceil() as usize);
-        let upper = format!("≤ {}", quantity::duration(*upper_ns as f64 * 1e-9));
+        let upper = format!("≤ {}", quantity::duration(*upper_ns as f64 * 1e-9, 3));
         format!("{upper:>10}  {bar:<40}  {}\n", quantity::count(*count))
     };
     octaves.iter().map(line).collect()

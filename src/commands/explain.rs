@@ -3,6 +3,7 @@
 use super::End;
 use crate::args::Explain;
 use crate::compile::{self, Explanation, Method, Stopwatch, Verdict};
+use crate::quantity::duration;
 use crate::terminal::{Style, Terminal};
 use crate::{project, report};
 use serde_json::json;
@@ -143,11 +144,11 @@ pub(super) fn tell(explanation: &Explanation, bounds: &[Bound], terminal: &mut T
             terminal.line(&format!(
                 "    {:<8} {} in the middle, all but 100 below {}, worst {}; with a margin of {MARGIN} {}: cycles of {} or more",
                 bound.method.name(),
-                nanoseconds(bound.median),
-                nanoseconds(bound.most),
-                nanoseconds(bound.worst),
-                nanoseconds(MARGIN * bound.worst),
-                nanoseconds(2.0 * MARGIN * bound.worst),
+                duration(1e-9 * bound.median, 4),
+                duration(1e-9 * bound.most, 4),
+                duration(1e-9 * bound.worst, 4),
+                duration(1e-9 * MARGIN * bound.worst, 4),
+                duration(1e-9 * 2.0 * MARGIN * bound.worst, 4),
             ));
         }
     }
@@ -166,14 +167,14 @@ pub(super) fn tell(explanation: &Explanation, bounds: &[Bound], terminal: &mut T
     terminal.line("");
 }
 
-/// `euler 20 us, rk4 28 us, expo any, implicit any`; none for a model without states to integrate.
+/// `euler 20 µs, rk4 28 µs, expo any, implicit any`; none for a model without states to integrate.
 fn stable_steps(explanation: &Explanation) -> Option<String> {
     let one = |step: &compile::StepCost| {
         let most = step.stable?;
         let most = match most {
             0.0 => "none".into(),
             most if most >= compile::LONGEST_STEP => "any".into(),
-            most => compile::two_digits_time(most),
+            most => duration(most, 2),
         };
         Some(format!("{} {most}", step.method.name()))
     };
@@ -253,15 +254,6 @@ fn bounds(loaded: &compile::Loaded, explanation: &Explanation) -> Vec<Bound> {
         Some(Bound { method, median: calls[CALLS / 2], most: calls[CALLS - 101], worst: calls[CALLS - 1] })
     };
     timed.filter_map(|step| bound(step.method)).collect()
-}
-
-/// Formats a short time.
-fn nanoseconds(ns: f64) -> String {
-    match ns {
-        ns if ns < 1e3 => format!("{ns:.0} ns"),
-        ns if ns < 1e6 => format!("{:.3} us", ns / 1e3),
-        ns => format!("{:.3} ms", ns / 1e6),
-    }
 }
 
 /// The page of a code: from its heading to the next.

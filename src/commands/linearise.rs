@@ -222,7 +222,7 @@ fn object(linear: &Linear, found: &Matrices, modes: &[Mode]) -> Value {
 fn words(linear: &Linear, found: &Matrices, modes: &[Mode], terminal: &Terminal) -> String {
     let description = linear.instance.description();
     let mut out = terminal.styled(Style::Bold, &description.name);
-    out += &format!(" at t = {}; all in SI\n", quantity::duration(linear.instance.get(Slot::TIME)));
+    out += &format!(" at t = {}; all in SI\n", quantity::duration(linear.instance.get(Slot::TIME), 3));
     let regimes: Vec<String> = description
         .automata
         .iter()

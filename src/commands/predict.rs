@@ -320,9 +320,9 @@ fn step_time(ready: &Ready) -> (String, Value) {
     let period = ready.rig.period_ns as f64 * 1e-9;
     let words = format!(
         "step        {} here, at most {}, of {}\n",
-        crate::quantity::duration(median),
-        crate::quantity::duration(greatest),
-        crate::quantity::duration(period)
+        crate::quantity::duration(median, 3),
+        crate::quantity::duration(greatest, 3),
+        crate::quantity::duration(period, 3)
     );
     (words, json!({"median": median, "greatest": greatest, "period": period}))
 }

@@ -264,7 +264,7 @@ impl Prompt<'_> {
         }
         let h = self.time(rest, "step 1 ms")?;
         let (time, all) = self.session.step(h)?;
-        self.terminal.line(&format!("t = {}", runtime::format::time(time)));
+        self.terminal.line(&format!("t = {}", abi::format::time(time)));
         let width = all.iter().map(|shown| shown.path.chars().count()).max().unwrap_or(0);
         for shown in all {
             let now = plain(&shown.now);
@@ -559,7 +559,7 @@ fn over(text: &str) -> Option<(&str, String, &str, &str, bool)> {
 fn stopped(ran: &Ran) -> Result<(), Fault> {
     match ran.results.iter().find_map(|result| result.as_ref().err()) {
         Some(failure) if failure.cause == Cause::Stopped => {
-            Err(Fault::Words(format!("stopped at {}; the session goes on", runtime::format::time(failure.time))))
+            Err(Fault::Words(format!("stopped at {}; the session goes on", abi::format::time(failure.time))))
         }
         Some(failure) => Err(Fault::Stopped(Box::new(failure.clone()))),
         None => Ok(()),

@@ -333,13 +333,13 @@ impl Table {
             ColumnKind::Case => case.label.clone(),
             ColumnKind::Varied => {
                 let k = self.vary.iter().position(|vary| vary.path == column.axis.name).expect("it is varied");
-                runtime::format::plain(self.vary[k].unit.from_si(values[k]))
+                abi::format::plain(self.vary[k].unit.from_si(values[k]))
             }
             ColumnKind::Measure(k, j) => {
                 // For an expectation that could not be evaluated, some measures may be missing.
                 let text = &case.experiment.expects[k].measures[j].text;
                 let found = readings.get(k).and_then(|read| read.iter().find(|(known, _)| known == text));
-                found.map_or(String::new(), |(_, value)| runtime::format::plain(*value))
+                found.map_or(String::new(), |(_, value)| abi::format::plain(*value))
             }
             ColumnKind::Verdict(k) => verdicts.get(k).map_or(String::new(), bool::to_string),
             ColumnKind::Status => status.split_whitespace().collect::<Vec<_>>().join(" "),
@@ -441,7 +441,7 @@ impl Table {
                 args.experiment,
                 results::solver(&self.cases[0].experiment.solver),
                 count(written),
-                quantity::duration(wall),
+                quantity::duration(wall, 3),
                 significant(speed, 3),
                 threads,
                 if threads == 1 { "" } else { "s" }
@@ -486,7 +486,7 @@ impl Table {
             ColumnKind::Run => cell == run.to_string(),
             ColumnKind::Case => cell == self.cases[at].label,
             ColumnKind::Varied => {
-                varied.next().is_some_and(|(vary, value)| cell == runtime::format::plain(vary.unit.from_si(*value)))
+                varied.next().is_some_and(|(vary, value)| cell == abi::format::plain(vary.unit.from_si(*value)))
             }
             ColumnKind::Measure(..) => cell.is_empty() || cell.parse::<f64>().is_ok(),
             ColumnKind::Verdict(_) => matches!(cell, "" | "true" | "false"),

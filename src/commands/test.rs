@@ -85,7 +85,7 @@ fn experiment(args: &Test, loaded: &mut Loaded, name: &str, timings: &mut Timing
     };
     let passed = held && crossed.as_ref().is_some_and(|all| all.iter().all(Crossed::passed));
     if !(passed && args.quiet) {
-        terminal.line(&line(terminal, passed, name, &duration(done.wall)));
+        terminal.line(&line(terminal, passed, name, &duration(done.wall, 3)));
     }
     for (case, result) in done.cases.iter().zip(&done.results) {
         let label = if case.label.is_empty() { String::new() } else { format!("{}: ", case.label) };

@@ -49,7 +49,7 @@ pub(super) fn follow(file: &str, name: &str, restart: bool, session: &mut Sessio
                 let draws = run_figure(&ran, false);
                 show_run(&ran, false, terminal);
                 if let Some(carried) = &ran.carried {
-                    terminal.line(&format!("  goes on from t = {}{}", runtime::format::time(passed), told(carried)));
+                    terminal.line(&format!("  goes on from t = {}{}", abi::format::time(passed), told(carried)));
                 }
                 if let Some(drawn) = draws {
                     terminal.print(&plot::terminal(&drawn, terminal.width(), terminal.colour()));
@@ -63,7 +63,7 @@ pub(super) fn follow(file: &str, name: &str, restart: bool, session: &mut Sessio
                     passed = if from.is_some() { passed } else { 0.0 } + at.as_ref().map_or(0.0, time_of);
                     live = at;
                 }
-                let took = crate::quantity::duration(begun.elapsed().as_secs_f64());
+                let took = crate::quantity::duration(begun.elapsed().as_secs_f64(), 3);
                 terminal.line(&format!("  {took} from text to plot; waiting for {file} (Ctrl-C ends)"));
             }
             // The last successful run stays: the next save may be correct.

@@ -6,12 +6,13 @@
 //! many ticks to stop. M is 1/|a|, where a is the change of the speed's rate per unit of force.
 
 use crate::frontend::system::*;
-use crate::frontend::units::{Types, three_digits};
+use crate::frontend::units::Types;
 use crate::ir::interpret::Interpreter;
 use crate::ir::program::Program;
+use abi::format::quantity;
 use abi::plan::Method;
 use abi::table::Code;
-use abi::unit::{Dimension, Unit};
+use abi::unit::Dimension;
 use abi::{Function, Instance};
 use grammar::ast::BinaryOp;
 use grammar::diagnostic::Diagnostic;
@@ -106,7 +107,7 @@ fn said(
         return None;
     }
     let (var, unit) = (system.var(contact.mass), &types.units[contact.mass.0 as usize]);
-    let shown = |value: f64| shown(value, unit);
+    let shown = |value: f64| quantity(value, unit, 3);
     let effect = if told > acts_on { "the contact throws the speed to and fro" } else { "the contact stops late" };
     let path = &var.path;
     Some(
@@ -139,9 +140,4 @@ fn parts_of(system: &System, id: VarId) -> Vec<(VarId, f64)> {
         }
     }
     found
-}
-
-/// A value with three digits in a unit.
-fn shown(value: f64, unit: &Unit) -> String {
-    format!("{} {unit}", three_digits(unit.from_si(value)))
 }

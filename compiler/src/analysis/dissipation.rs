@@ -17,6 +17,7 @@ use crate::ir::{Func, Op, Value};
 use crate::lower::{Lowered, Wanted, lower};
 use crate::numerics::autodiff;
 use abi::description::Slot;
+use abi::format::{prefixed, quantity, three_digits};
 use abi::unit::{Dimension, Unit};
 use grammar::diagnostic::Diagnostic;
 use std::rc::Rc;
@@ -210,7 +211,7 @@ fn creep(system: &System, bench: &mut Bench, force: &Var, found: &mut Vec<Diagno
         if bench.force_at(middle, 0.0) >= load { high = middle } else { low = middle }
     }
     let warning = Diagnostic::warning("W0702", "this friction model cannot hold a load")
-        .label(force.span, format!("{} N moves it at {}", three_digits(load), speed(high)))
+        .label(force.span, format!("{} N moves it at {}", three_digits(load), quantity(high, &prefixed("m/s", high).0, 3)))
         .help("at rest it carries nothing: use KFM, Karnopp or a model with a bristle to hold a load.\nTo keep it: `allow creep \"...\"`");
     found.push(warning);
 }
@@ -227,17 +228,6 @@ fn decade(k: i32, n: i32) -> f64 {
         sum += term;
     }
     (0..whole.abs()).fold(sum, |value, _| if whole > 0 { value * 10.0 } else { value / 10.0 })
-}
-
-/// A speed with a suitable prefix.
-fn speed(v: f64) -> String {
-    let (scale, unit) = match v.abs() {
-        x if x < 1e-6 => (1e-9, "nm/s"),
-        x if x < 1e-3 => (1e-6, "um/s"),
-        x if x < 1.0 => (1e-3, "mm/s"),
-        _ => (1.0, "m/s"),
-    };
-    format!("{} {unit}", three_digits(v / scale))
 }
 
 /// Whether a friction model on its own dissipates: F v − dV/dt ≥ 0, and F v ≥ min(0, F_ext v) with an external force.

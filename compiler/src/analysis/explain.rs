@@ -9,7 +9,7 @@ use crate::codegen::target::{FunctionCompiler, here};
 use crate::frontend::causality::{Phase, rate_of, value_of};
 use crate::frontend::source::Files;
 use crate::frontend::system::*;
-use crate::frontend::units::{Types, three_digits};
+use crate::frontend::units::Types;
 use crate::ir::build::{Build, Env};
 use crate::ir::expr::Shared;
 use crate::ir::program::Program;
@@ -18,6 +18,7 @@ use crate::lower::{Lowered, lower};
 use crate::numerics::{autodiff, fixed_step};
 use crate::opt::reassociate::reassociate;
 use abi::description::Slot;
+use abi::format::{duration, three_digits};
 use abi::plan::Method;
 use grammar::ast::BinaryOp;
 use grammar::span::Span;
@@ -422,21 +423,10 @@ impl Stepped {
             text += &format!(
                 "; own rate {} 1/s{at}, where euler needs steps below {} and rk4 below {}",
                 three_digits(rate),
-                time(2.0 / rate),
-                time(2.785 / rate)
+                duration(2.0 / rate, 3),
+                duration(2.785 / rate, 3)
             );
         }
         text
     }
-}
-
-/// A time with a suitable prefix.
-fn time(t: f64) -> String {
-    let (scale, unit) = match t {
-        t if t < 1e-6 => (1e-9, "ns"),
-        t if t < 1e-3 => (1e-6, "us"),
-        t if t < 1.0 => (1e-3, "ms"),
-        _ => (1.0, "s"),
-    };
-    format!("{} {unit}", three_digits(t / scale))
 }

@@ -6,9 +6,10 @@
 use crate::frontend::delays;
 use crate::frontend::source::Files;
 use crate::frontend::system::*;
-use crate::frontend::units::{Types, three_digits};
+use crate::frontend::units::Types;
 use crate::lower::evaluate;
-use abi::live::{self, shown};
+use abi::format::{quantity, three_digits};
+use abi::live;
 use grammar::ast::BinaryOp;
 use grammar::diagnostic::Diagnostic;
 use grammar::span::Span;
@@ -109,7 +110,7 @@ fn ranges(system: &System, types: &Types, files: &Files, diagnostics: &mut Vec<D
         }
         let Some(beyond) = live::beyond(value, low, high) else { continue };
         let unit = &types.units[id.0 as usize];
-        let show = |x: f64| shown(x, unit);
+        let show = |x: f64| quantity(x, unit, 3);
         let (word, bound) = (beyond.word, show(beyond.bound));
         let model = &system.instance(var.instance).model;
         let message = live::beyond_words(&var.name, model, unit, value, beyond);
@@ -221,7 +222,7 @@ fn requires(system: &System, types: &Types, files: &Files, diagnostics: &mut Vec
                     labels.push((system.span(*node), format!("the default of {}", var.name)));
                 }
                 Definition::Value(node, _) => {
-                    let value = shown(evaluate(system, types, &[*node])[0], &types.units[id.0 as usize]);
+                    let value = quantity(evaluate(system, types, &[*node])[0], &types.units[id.0 as usize], 3);
                     labels.push((info.span, format!("{} keeps its default, {value}", var.name)));
                 }
                 _ => {}

@@ -13,6 +13,7 @@ use crate::frontend::units::Types;
 use crate::ir::program::Program;
 use crate::numerics::fixed_step;
 use abi::Slot;
+use abi::format::{duration, prefixed, quantity, significant};
 use abi::plan::{Method, Steps};
 use abi::unit::Unit;
 use grammar::ast::BinaryOp;
@@ -93,7 +94,7 @@ impl Fixed<'_> {
     fn unstable(&self, unstable: &Unstable, implicit: bool, files: &Files) -> Diagnostic {
         let (system, id) = (self.system, self.state(unstable.state));
         let var = system.var(id);
-        let (method, step) = (self.method.name(), time(self.step));
+        let (method, step) = (self.method.name(), duration(self.step, 3));
         let own = states(system, self.program).into_iter().find(|state| state.path == var.path).map(|state| state.own);
         let linear = own == Some(Own::Affine) && self.method.row().steps == Steps::Explicit;
         let stiff = unstable.rate * self.step > 1.0;
@@ -105,7 +106,7 @@ impl Fixed<'_> {
         };
         let scanned = unstable.along.as_ref().and_then(|along| Some((along, self.name_of(along, var.instance)?)));
         let open = scanned.as_ref().is_some_and(|(along, _)| !along.closed);
-        let needed = two_digits_time(unstable.stable);
+        let needed = duration(unstable.stable, 2);
 
         let message = match open {
             true => format!("{method} at {step} is a large step for this model"),
@@ -114,9 +115,9 @@ impl Fixed<'_> {
         let mut out = if open { Diagnostic::warning("W0704", message) } else { Diagnostic::error("E0702", message) };
         let rate = match &scanned {
             Some((along, (_, unit))) if stiff && !along.inward => {
-                format!("a rate of {} 1/s per {}", two_digits(unstable.rate / along.farthest * unit.scale), unit.text)
+                format!("a rate of {} 1/s per {}", two(unstable.rate / along.farthest * unit.scale), unit.text)
             }
-            _ if stiff => format!("a rate of {} 1/s", two_digits(unstable.rate)),
+            _ if stiff => format!("a rate of {} 1/s", two(unstable.rate)),
             _ => "it swings faster than such steps can follow".into(),
         };
         let equation = self.slope(id).filter(|_| stiff).map(|slope| format!("{slope}: ")).unwrap_or_default();
@@ -170,8 +171,8 @@ impl Fixed<'_> {
         let moved = quantities.iter().find(|quantity| quantity.slot == slot).expect("it was moved");
         let unit = self.system.var_ids().find(|id| self.system.var(*id).path == moved.path);
         let unit = unit.map_or(&moved.unit, |id| &self.types.units[id.0 as usize]);
-        let (at, step) = (amount(value, unit), time(self.step));
-        let rate = two_digits(singular.rate);
+        let (at, step) = (amount(value, unit), duration(self.step, 3));
+        let rate = two(singular.rate);
         // With γhλ ≤ ½ the equations of a step are far from singular.
         let shorter = below(0.5 / (fixed_step::GAMMA * singular.rate));
         let shorter = if self.rig {
@@ -183,10 +184,7 @@ impl Fixed<'_> {
             .label(self.run, format!("near {} = {at} the model itself grows at {rate} 1/s", moved.path))
             .label(
                 self.place,
-                format!(
-                    "from {} 1/s on a step overshoots without limit",
-                    two_digits(1.0 / (fixed_step::GAMMA * self.step))
-                ),
+                format!("from {} 1/s on a step overshoots without limit", two(1.0 / (fixed_step::GAMMA * self.step))),
             )
             .help(format!(
                 "{shorter}{}\nTo keep it: `allow large-step \"...\"`",
@@ -296,7 +294,7 @@ impl Fixed<'_> {
         Some(match system.node(id) {
             Node::Var(var) => system.var(*var).name.clone(),
             Node::Fits { value, .. } => self.tight(*value, depth)?,
-            Node::Number { value, dimension, .. } if dimension.is_none_or(|d| d.is_none()) => two_digits(*value),
+            Node::Number { value, dimension, .. } if dimension.is_none_or(|d| d.is_none()) => two(*value),
             Node::Call(Builtin::Abs, args) => format!("|{}|", self.tight(args[0], depth + 1)?),
             Node::Binary(BinaryOp::Multiply, a, b) => {
                 format!("{}*{}", self.tight(*a, depth + 1)?, self.tight(*b, depth + 1)?)
@@ -331,49 +329,20 @@ fn whole_instance(files: &Files, name: Span) -> Span {
     Span::new(name.file, start, name.end as usize)
 }
 
-/// A number with two digits.
-fn two_digits(x: f64) -> String {
-    let scientific = format!("{x:.1e}");
-    let (mantissa, exponent) = scientific.split_once('e').unwrap_or((&scientific, "0"));
-    let mantissa = mantissa.strip_suffix(".0").unwrap_or(mantissa);
-    match exponent.parse::<i32>() {
-        Ok(power @ -3..=3) => {
-            let decimals = (1 - power).max(0) as usize;
-            let rounded: f64 = scientific.parse().unwrap_or(x);
-            let text = format!("{rounded:.decimals$}");
-            if text.contains('.') { text.trim_end_matches('0').trim_end_matches('.').to_string() } else { text }
-        }
-        _ => format!("{mantissa}e{exponent}"),
-    }
-}
-
-/// A value in the unit of a quantity, with a suitable prefix if the unit allows one.
+/// A value in the unit of a quantity, with a suitable prefix if it has none of its own.
 fn amount(value: f64, unit: &Unit) -> String {
-    let prefixed = [(1.0, ""), (1e-3, "m"), (1e-6, "u"), (1e-9, "n")];
-    let plain = unit.scale == 1.0 && unit.text.starts_with(['m', 'r', 'N']) && !unit.text.contains('^');
-    let (scale, prefix) = match plain {
-        true => *prefixed.iter().find(|(scale, _)| value.abs() >= 0.0999 * scale).unwrap_or(&prefixed[3]),
-        false => (unit.scale, ""),
-    };
-    format!("{} {prefix}{}", two_digits(value / scale), unit.text).trim_end().to_string()
+    let unit = if unit.scale == 1.0 { &prefixed(&unit.text, value.abs()).0 } else { unit };
+    quantity(value, unit, 2)
 }
 
-const TIMES: [(f64, &str); 4] = [(1.0, "s"), (1e-3, "ms"), (1e-6, "us"), (1e-9, "ns")];
-
-fn time(t: f64) -> String {
-    let (scale, unit) = TIMES.into_iter().find(|(scale, _)| t >= 0.999 * scale).unwrap_or(TIMES[3]);
-    format!("{} {unit}", crate::frontend::units::three_digits(t / scale))
-}
-
-/// A time with two digits.
-pub fn two_digits_time(t: f64) -> String {
-    let (scale, unit) = TIMES.into_iter().find(|(scale, _)| t >= 0.999 * scale).unwrap_or(TIMES[3]);
-    format!("{} {unit}", two_digits(t / scale))
+/// A number with two digits.
+fn two(x: f64) -> String {
+    significant(x, 2)
 }
 
 /// The greatest round time (1, 2 or 5 times a power of ten) that is not above t.
 fn below(t: f64) -> String {
     let round = (-9..=0).rev().flat_map(|power| [5.0, 2.0, 1.0].map(|digit| digit * ten_to(power)));
     let mut round = round;
-    two_digits_time(round.find(|x| *x <= t).unwrap_or(1e-9))
+    duration(round.find(|x| *x <= t).unwrap_or(1e-9), 2)
 }

@@ -15,8 +15,8 @@ use crate::frontend::resolve::Loaded;
 use crate::frontend::source::Sources;
 use crate::frontend::system::*;
 use crate::frontend::tables::columns as columns_of;
-use crate::frontend::units::{self, Types};
-use crate::ir::{Binary, Unary};
+use crate::frontend::units::Types;
+use crate::ir::Binary;
 use crate::lower::{Lowered, MOST_DENSE, Wanted, evaluate, lower};
 use crate::pipeline::{Depth, analyse};
 use crate::rig::{self, Prepared};
@@ -657,7 +657,7 @@ fn variant(
         parameter_checks::whole_periods(&system, &types, solver.step, at, &mut reader.diagnostics);
         delays::fits(&system, solver.step, at, &mut reader.diagnostics);
         if duration / solver.step > MOST_STEPS {
-            let steps = units::three_digits(duration / solver.step);
+            let steps = abi::format::three_digits(duration / solver.step);
             let error = Diagnostic::error("E0902", format!("{steps} steps are too many"))
                 .label(parts.run.span, "so long a run with such short steps");
             reader
@@ -942,7 +942,7 @@ impl Reader<'_> {
         if (ratio - ratio.round()).abs() > 1e-9 * ratio || !(1.0..=1e5).contains(&ratio.round()) {
             let span = parts.solver.map_or(parts.run.span, |solver| solver.span);
             let error = Diagnostic::error("E0701", "the step between ticks does not divide the period of the rig")
-                .label(span, format!("{} steps in {} s", units::three_digits(ratio), period));
+                .label(span, format!("{} steps in {} s", abi::format::three_digits(ratio), period));
             self.diagnostics.push(error.help("take a step that divides it, such as `step 20 us` of 1 ms"));
         }
         solver

@@ -4,11 +4,11 @@
 //! cycles, because the present x is not needed.
 
 use crate::frontend::system::*;
-use crate::frontend::units::three_digits;
 use crate::ir::Func;
 use crate::ir::build::Build;
 use abi::Slot;
 use abi::description::{Layout, Segment};
+use abi::format::{duration, three_digits};
 use grammar::diagnostic::Diagnostic;
 use grammar::span::Span;
 
@@ -79,10 +79,11 @@ pub fn fits(system: &System, step: f64, at: Option<Span>, diagnostics: &mut Vec<
         let (_, time) = of(system, *delay);
         let Some((least, most)) = range(system, time) else { continue };
         let mut error = if least > 0.0 && step > least * (1.0 + 1e-12) {
-            let message = format!("a step of {} is longer than this delay may be, {}", shown(step), shown(least));
+            let message =
+                format!("a step of {} is longer than this delay may be, {}", duration(step, 3), duration(least, 3));
             Diagnostic::error("E0503", message)
                 .label(system.span(*delay), "its value is not known within the step")
-                .help(format!("take steps of {} or less", shown(least)))
+                .help(format!("take steps of {} or less", duration(least, 3)))
         } else {
             samples += slots(most, step);
             if samples <= MOST_SAMPLES {
@@ -90,7 +91,7 @@ pub fn fits(system: &System, step: f64, at: Option<Span>, diagnostics: &mut Vec<
             }
             samples = f64::NEG_INFINITY;
             Diagnostic::error("E0503", format!("{} steps of the past are too many to keep", three_digits(most / step)))
-                .label(system.span(*delay), format!("up to {} back", shown(most)))
+                .label(system.span(*delay), format!("up to {} back", duration(most, 3)))
                 .help("narrow the range of the delay or take longer steps: four million samples are the limit")
         };
         if let Some(at) = at {
@@ -106,14 +107,6 @@ pub fn linear(system: &System) -> Option<Diagnostic> {
     let error = Diagnostic::error("E0905", "a model with a `delay` cannot be linearised yet")
         .label(system.span(*delay), "depends on the past, not on states alone");
     Some(error.help("a first-order lag comes close for slow motions: `dy/dt = (x - y) / T`"))
-}
-
-/// A time for a message.
-fn shown(seconds: f64) -> String {
-    match seconds < 1.0 {
-        true => format!("{} ms", three_digits(seconds * 1e3)),
-        false => format!("{} s", three_digits(seconds)),
-    }
 }
 
 /// Slots of a ring buffer that reaches `most` s back in steps of `step` s: a power of two.

@@ -7,7 +7,7 @@
 use crate::frontend::source::Files;
 use crate::frontend::system::*;
 use crate::functions::Units;
-pub use abi::unit::three_digits;
+use abi::format::three_digits;
 use abi::unit::{Angle, Dimension, Ratio, Unit};
 use grammar::ast::BinaryOp;
 use grammar::diagnostic::Diagnostic;

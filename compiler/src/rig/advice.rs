@@ -6,10 +6,10 @@
 
 use super::Places;
 use crate::analysis::linearise::{Linear, Matrices, PortSlots};
-use crate::frontend::units::three_digits;
 use crate::ir::interpret::Interpreter;
 use crate::ir::program::Program;
 use abi::description::{Kind as QuantityKind, Quantity};
+use abi::format::{quantity, three_digits};
 use abi::rig::{Kind, Mode, Rig, Signal, What};
 use abi::series::Method;
 use abi::table::Code;
@@ -206,7 +206,7 @@ fn contact(rig: &Rig, control: &Program, plant: &Program, command: Signal, slot:
 
 fn resolution(rig: &Rig, control: &Program, places: &Places, found: &mut Vec<Diagnostic>) {
     let quantities = &control.description.quantities;
-    let shown = |value: f64, unit: &Unit| format!("{} {unit}", three_digits(unit.from_si(value)));
+    let shown = |value: f64, unit: &Unit| quantity(value, unit, 3);
     let used = |what: What, node: usize| rig.inputs.iter().any(|input| input.signal == Signal { node, what });
     let params = |dimension: Dimension, angular: bool| {
         let all = quantities.iter().filter(move |q| {

@@ -22,7 +22,7 @@ use crate::frontend::flatten::{self, BusNode, Frame, Framed, Instance, Override,
 use crate::frontend::resolve::{ItemRef, Loaded, Lookup, Space};
 use crate::frontend::source::{Files, Sources, Tree};
 use crate::frontend::system::*;
-use crate::frontend::units::{self, Types};
+use crate::frontend::units::Types;
 use crate::ir::program::Program;
 use crate::lower::{Wanted, evaluate};
 use crate::pipeline::{Depth, analyse};
@@ -664,7 +664,7 @@ impl<'a> Reader<'a, '_> {
             // NaN for values that are not known before the run.
             let value = evaluate(&system, &types, &[*expr])[0];
             if value < range.0 || value > range.1 {
-                let [low, high] = [range.0, range.1].map(|end| units::three_digits(unit.from_si(end)));
+                let [low, high] = [range.0, range.1].map(|end| abi::format::three_digits(unit.from_si(end)));
                 let error = Diagnostic::error("E0802", words::cannot_be(path, unit, value))
                     .label(system.span(*expr), format!("its field carries {low} .. {high}"));
                 self.report(error.help("send what fits, or describe the field with more bits or a coarser `scale`"));

@@ -322,7 +322,7 @@ impl Reader<'_, '_> {
         let safe = send.safe.map_or(0.0, number);
         let text = self.files.slice(send.path).to_string();
         let shown = |value: f64| {
-            let number = units::three_digits(send.unit.from_si(value));
+            let number = abi::format::three_digits(send.unit.from_si(value));
             if send.unit.text.is_empty() { number } else { format!("{number} {}", send.unit) }
         };
         // The narrowest representation that the command must fit.
@@ -371,7 +371,7 @@ impl Reader<'_, '_> {
             refuse("E0808", message, format!("{} is not 0", shown(safe)), format!("write `safe {text} = {zero}`"));
         }
         if slew <= 0.0 {
-            let message = format!("a slew of {} never gets anywhere", units::three_digits(slew));
+            let message = format!("a slew of {} never gets anywhere", abi::format::three_digits(slew));
             refuse("E0802", message, "not positive".into(), "give the greatest change per second".into());
         }
         // Without a stated limit, a command is limited to what the drive permits.

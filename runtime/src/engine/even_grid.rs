@@ -5,9 +5,9 @@
 //! value after it. Fixed steps are not interpolated, so T is a multiple of the step.
 
 use crate::engine::{Continue, Failure, sample};
-use crate::format;
 use crate::record::{Recorder, Recording};
 use abi::Instance;
+use abi::format;
 use abi::live::is_multiple;
 use abi::plan::{Experiment, Method};
 

@@ -8,8 +8,9 @@
 
 use crate::safety::{Protection, is_present};
 use abi::description::Guard;
+use abi::format::three_digits;
 use abi::live::{Live, NUMBERS, Place};
-use abi::unit::{NoQuantity, Unit, quantity, three_digits};
+use abi::unit::{NoQuantity, Unit, quantity};
 use abi::{Function, Instance, Slot};
 use std::sync::Arc;
 

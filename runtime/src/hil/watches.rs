@@ -7,8 +7,8 @@
 use crate::realtime::clock::monotonic_ns;
 use crate::safety::{DriveLimits, OutputLimits, Protection, Refused, is_present};
 use abi::Instance;
+use abi::format::three_digits;
 use abi::rig::{Kind, Mode, Output, Rig, Signal, What};
-use abi::unit::three_digits;
 
 /// Highest torque and speed of a drive, where known.
 #[derive(Clone, Copy, PartialEq, Debug, Default)]

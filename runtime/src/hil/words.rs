@@ -1,10 +1,10 @@
 //! Messages of a rig as text.
 
 use super::counts::Counts;
-use crate::format;
 use crate::realtime::histogram::Histogram;
 use crate::safety::Cause;
 use abi::Description;
+use abi::format;
 use abi::rig::{Kind, Rig, Signal, What};
 use std::fmt::Write;
 
@@ -38,7 +38,7 @@ pub fn cause(rig: &Rig, model: &Description, signals: &[Signal], cause: Cause, t
         Cause::NotFinite(i) => format!("the model gave no number for {}", output(i)),
         Cause::Guard(status) => match model.guards.get(usize::try_from(status).unwrap_or(0).wrapping_sub(1)) {
             Some(guard) => {
-                let (low, high) = guard.bounds(|bound| format::quantity(bound, &guard.unit));
+                let (low, high) = guard.bounds(|bound| format::quantity(bound, &guard.unit, 3));
                 format!("{} left its range {low} .. {high}", guard.path)
             }
             None => format!("the model could not go on (status {status})"),

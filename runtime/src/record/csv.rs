@@ -3,7 +3,7 @@
 //! Values are in the units shown, as the shortest decimals that parse to the same bits.
 
 use super::Recording;
-use crate::format;
+use abi::format;
 use std::fs::{self, File};
 use std::io::{self, BufWriter, Write};
 use std::path::Path;

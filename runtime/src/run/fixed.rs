@@ -1,9 +1,9 @@
 //! A run with fixed steps, each a call of the model's compiled step function.
 
-use crate::format;
 use crate::run::observe::{Observer, check_finite, check_status};
 use crate::run::outcome::{Cause, Continue, Stop};
 use crate::run::stepper::{Rest, Stepper};
+use abi::format;
 use abi::plan::Experiment;
 use abi::table::keep_time;
 use abi::{Function, Instance, Slot};

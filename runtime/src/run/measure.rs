@@ -6,13 +6,13 @@
 //! adaptive run adds a point at each edge and integrates its own dense output. For other runs, integrals use the
 //! trapezoidal rule with Gregory's end corrections, of order four where the steps are even.
 
-use crate::format;
 use crate::run::crossing::{Lobes, period, settling};
 use crate::run::hills::{Hills, Turn};
 use crate::run::peak::{Peak, Point};
 use crate::run::quadrature::{Even, Sum};
 use crate::run::verdict::{self, Reading, Verdict};
 use abi::Slot;
+use abi::format;
 use abi::plan::{Edge, Expect, Measure, MeasureKind, Moment};
 
 /// Most points that one `period` or `settling` keeps: 2²⁵, half a gigabyte. With more points the measure fails with a

@@ -1,9 +1,9 @@
 //! The outcome of a run: its results, or why it stopped.
 
-use crate::format;
 use crate::record::Recording;
 use crate::run::verdict::Verdict;
 use abi::description::Guard;
+use abi::format;
 use abi::plan::Solver;
 use abi::unit::Unit;
 use std::fmt;
@@ -178,9 +178,9 @@ impl fmt::Display for Failure {
         match &self.cause {
             Cause::Guard { guard, value } => {
                 let Guard { path, unit, .. } = &**guard;
-                let value = format::quantity(*value, unit);
+                let value = format::quantity(*value, unit, 3);
                 let (low, _) = guard.bounds(|bound| format::plain(unit.from_si(bound)));
-                let (_, high) = guard.bounds(|bound| format::quantity(bound, unit));
+                let (_, high) = guard.bounds(|bound| format::quantity(bound, unit, 3));
                 write!(f, "`{path}` left its range {low} .. {high}: it is {value} at {time}")
             }
             Cause::NotFinite { path, value } if value.is_nan() => {

@@ -297,7 +297,7 @@ fn advice(fixed: &Experiment, error: f64, tried: &mut dyn FnMut(f64) -> Option<f
         if let Some(found) = found.filter(|found| *found <= GOAL) {
             return format!(
                 "{name} step {} would do: within {goal} on average ({} % tried)",
-                duration(next),
+                duration(next, 3),
                 significant(100.0 * found, 2)
             );
         }
