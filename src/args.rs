@@ -9,7 +9,7 @@ use crate::vary::{self, Vary};
 use abi::image::{Feature, Target};
 use abi::plan::Method;
 use abi::unit::{Dimension, Unit};
-use clap::{Parser, Subcommand, ValueHint};
+use clap::{CommandFactory, Parser, Subcommand, ValueHint};
 use runtime::can::address::Address;
 use std::path::PathBuf;
 
@@ -20,6 +20,30 @@ pub struct Args {
     /// What to do; a session at the prompt if nothing is said.
     #[command(subcommand)]
     pub command: Option<Command>,
+}
+
+/// The arguments of this process; ends it with a message if they are wrong, or if they ask for help.
+pub fn parse() -> Args {
+    Args::parse()
+}
+
+/// A script that completes the commands and options in a shell.
+pub fn completions(shell: clap_complete::Shell) -> String {
+    let mut out = Vec::new();
+    clap_complete::generate(shell, &mut Args::command(), "fric", &mut out);
+    String::from_utf8_lossy(&out).into_owned()
+}
+
+/// The manual page of the program, or of one of its commands.
+pub fn man(command: Option<&str>) -> String {
+    let (mut out, mut tree) = (Vec::new(), Args::command());
+    // Only a built command tree knows the full name `fric run`.
+    tree.build();
+    let page = command.and_then(|name| tree.find_subcommand(name)).unwrap_or(&tree).clone();
+    let name = command.map_or("fric".into(), |name| format!("fric-{name}"));
+    let rendered = clap_mangen::Man::new(page).title(name).render(&mut out);
+    rendered.expect("writing to memory does not fail");
+    String::from_utf8_lossy(&out).into_owned()
 }
 
 const EXIT_CODES: &str = "Exit codes: 0 fine, 1 the input or an expectation failed, 2 wrong usage,\n\

@@ -30,14 +30,13 @@ mod ssh;
 mod unfinished;
 mod commands;
 
-use clap::Parser;
 use commands::End;
 use std::process::ExitCode;
 use std::time::Instant;
 
 fn main() -> ExitCode {
     let begin = Instant::now();
-    let args = args::Args::parse();
+    let args = args::parse();
     match commands::run(&args, begin, &mut terminal::Terminal::new()) {
         End::Fine => ExitCode::SUCCESS,
         End::Failed => ExitCode::from(1),

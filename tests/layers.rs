@@ -27,9 +27,10 @@ const CRATES: [(&str, &str, &[&str]); 6] = [
 /// that crate as its home.
 const HOMES: &[(&str, &[&str])] = &[
     ("can-dbc", &["compiler/src/rig/dbc.rs"]),
-    ("clap", &["src/args.rs", "src/compile.rs", "src/main.rs", "src/commands/mod.rs", "rig/src/main.rs"]),
-    ("clap_complete", &["src/args.rs", "src/commands/mod.rs"]),
-    ("clap_mangen", &["src/commands/mod.rs"]),
+    // An option's values are the cases of an enum: one of them lies where they are carried out.
+    ("clap", &["src/args.rs", "src/compile.rs", "rig/src/main.rs"]),
+    ("clap_complete", &["src/args.rs"]),
+    ("clap_mangen", &["src/args.rs"]),
     ("cranelift-codegen", &["compiler/src/codegen/"]),
     ("cranelift-frontend", &["compiler/src/codegen/"]),
     ("cranelift-jit", &["compiler/src/codegen/executable_memory.rs"]),
@@ -39,7 +40,8 @@ const HOMES: &[(&str, &[&str])] = &[
     ("csv", &["src/", "runtime/src/record/csv.rs"]),
     ("ct-codecs", &["src/signing.rs"]),
     ("ctrlc", &["src/interrupt.rs"]),
-    ("indicatif", &["src/commands/"]),
+    ("indicatif", &["src/commands/shared/progress.rs"]),
+    // The kernel's calls: descriptors and sockets, clocks and threads, signals.
     ("libc", &["runtime/src/can/", "runtime/src/realtime/", "runtime/src/hil/emergency.rs"]),
     ("memmap2", &["runtime/src/image.rs"]),
     ("miette", &["src/report.rs"]),
@@ -50,17 +52,18 @@ const HOMES: &[(&str, &[&str])] = &[
     ("parquet", &["src/parquet.rs"]),
     ("pest", &["grammar/src/parse.rs"]),
     ("pest_derive", &["grammar/src/parse.rs"]),
-    ("rayon", &["runtime/src/engine/sweep.rs", "runtime/src/coupling/loop_stability.rs"]),
+    ("rayon", &["runtime/src/engine/sweep.rs"]),
     ("resvg", &["src/plot/png.rs"]),
     ("rtrb", &["runtime/src/spsc.rs"]),
     ("rustix", &["runtime/src/record/parts.rs"]),
     ("rustyline", &["src/repl/line.rs"]),
+    // JSON is a form of every command's results.
     ("serde_json", &["src/"]),
     ("sha2", &["abi/src/image.rs"]),
     ("socketcan", &["runtime/src/can/socketcan.rs"]),
     ("stacker", &["grammar/src/parse.rs"]),
     ("strsim", &["compiler/src/frontend/names.rs"]),
-    ("tempfile", &["src/"]),
+    ("tempfile", &["src/commands/deploy.rs"]),
     ("terminal_size", &["src/terminal.rs"]),
 ];
 

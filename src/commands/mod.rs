@@ -27,17 +27,16 @@ mod run;
 mod sweep;
 mod test;
 
-use crate::args::{Args, Command, Key, Repl};
+use crate::args::{self, Args, Command, Key, Repl};
 use crate::compile::{self, Case, Loaded, Options, Sources, Stages, Stopwatch};
 use crate::terminal::Terminal;
 use crate::timings::Timings;
 use crate::{project, report};
-use clap::CommandFactory;
 use grammar::diagnostic::Diagnostic;
-use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use runtime::engine::sweep as runs;
 use runtime::engine::{Continue, Failure, Outcome};
 use runtime::record::Recording;
+use shared::progress;
 use std::path::Path;
 use std::time::Instant;
 
@@ -100,21 +99,11 @@ pub fn run(args: &Args, begin: Instant, terminal: &mut Terminal) -> End {
         Command::BenchRt(args) => bench_rt::bench_rt(args, terminal),
         Command::New(new) => new::new(new, terminal),
         Command::Completions { shell } => {
-            let mut out = Vec::new();
-            clap_complete::generate(*shell, &mut Args::command(), "fric", &mut out);
-            terminal.print(&String::from_utf8_lossy(&out));
+            terminal.print(&args::completions(*shell));
             End::Fine
         }
         Command::Man { command } => {
-            let mut out = Vec::new();
-            let mut tree = Args::command();
-            // Only a built command tree knows the full name `fric run`.
-            tree.build();
-            let page = command.as_ref().and_then(|name| tree.find_subcommand(name)).unwrap_or(&tree).clone();
-            let name = command.as_ref().map_or("fric".into(), |name| format!("fric-{name}"));
-            let rendered = clap_mangen::Man::new(page).title(name).render(&mut out);
-            rendered.expect("writing to memory does not fail");
-            terminal.print(&String::from_utf8_lossy(&out));
+            terminal.print(&args::man(command.as_deref()));
             End::Fine
         }
     }
@@ -263,18 +252,12 @@ fn done_beside<T: Send>(
     errors: bool,
     beside: impl FnOnce(&[Case], &[Recording]) -> T + Send,
 ) -> (Done, T) {
-    let bar = ProgressBar::with_draw_target(
-        Some(1000),
-        if quiet { ProgressDrawTarget::hidden() } else { ProgressDrawTarget::stderr() },
-    );
-    if let Ok(style) = ProgressStyle::with_template("  {bar:40} {percent:>3} %  {elapsed} of about {duration}") {
-        bar.set_style(style.progress_chars("━╸ "));
-    }
+    let bar = progress::bar(1000, "{percent:>3} %  {elapsed} of about {duration}", quiet);
     let begin = Instant::now();
     let watch = |fraction: f64| {
         // A short run needs no bar, and drawing one costs more than a batch of steps.
         if begin.elapsed().as_millis() > 400 {
-            bar.set_position((1000.0 * fraction) as u64);
+            bar.at((1000.0 * fraction) as u64);
         }
         Continue::Continue(())
     };
@@ -297,13 +280,13 @@ fn done_beside<T: Send>(
             return (beside(), 0.0);
         }
         let beside = scope.spawn(beside);
-        bar.set_position(0);
+        bar.at(0);
         runs::judge(&all, &mut results, &watch);
         let judging = begin.elapsed().as_secs_f64();
         (beside.join().unwrap_or_else(|why| std::panic::resume_unwind(why)), judging)
     });
     results.iter_mut().zip(recordings).for_each(|(result, own)| *recording(result) = own);
-    bar.finish_and_clear();
+    bar.clear();
     (Done { cases, results, wall, judging, stages }, told)
 }
 

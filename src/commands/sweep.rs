@@ -8,6 +8,7 @@
 mod errors;
 mod summary;
 
+use super::shared::progress;
 use super::{End, has_experiment, load, reported};
 use crate::args::Sweep;
 use crate::compile::{self, Changes, Fitted, Loaded, Options, Stopwatch, Varying};
@@ -20,7 +21,6 @@ use crate::vary::{Dice, Vary};
 use crate::{project, results};
 use abi::plan::{Formula, Measure};
 use abi::{Description, Slot};
-use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use runtime::engine::lanes::{self, Next};
 use runtime::engine::sweep::{self, Desk, Ticket};
 use runtime::engine::{self, Cause, Continue, Failure, Outcome};
@@ -505,12 +505,8 @@ impl Table {
         stopped: &AtomicBool,
     ) -> io::Result<u64> {
         let Writing { file, unfinished, mut mark } = into;
-        let target = if args.quiet { ProgressDrawTarget::hidden() } else { ProgressDrawTarget::stderr() };
-        let bar = ProgressBar::with_draw_target(Some(range.end - range.start), target);
-        let template = "  {bar:40} {human_pos} of {human_len}  {per_sec}  {eta} left";
-        if let Ok(style) = ProgressStyle::with_template(template) {
-            bar.set_style(style.progress_chars("━╸ "));
-        }
+        let rest = "{human_pos} of {human_len}  {per_sec}  {eta} left";
+        let bar = progress::bar(range.end - range.start, rest, args.quiet);
         let mut writer = BufWriter::new(file);
         let (mut written, mut failed) = (0, None);
         let mut flushed = Instant::now();
@@ -525,7 +521,7 @@ impl Table {
                     writer.flush()?;
                     unfinished.note(mark)?;
                     flushed = Instant::now();
-                    bar.set_position(written + 1);
+                    bar.at(written + 1);
                 }
                 Ok(())
             };
@@ -542,7 +538,7 @@ impl Table {
                 }
             }
         });
-        bar.finish_and_clear();
+        bar.clear();
         match failed {
             Some(error) => Err(error),
             None => writer.flush().map(|()| written),

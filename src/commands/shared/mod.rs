@@ -1,5 +1,7 @@
-//! Code shared by several commands: sessions with files under change, the comparison of two solvers, packages of rigs.
+//! Code shared by several commands: sessions with files under change, the comparison of two solvers, packages of rigs,
+//! progress bars.
 
 pub mod cross_check;
 pub mod package;
+pub mod progress;
 pub mod session;
