@@ -30,6 +30,17 @@ pub enum Recurring {
     Operations,
 }
 
+/// Mistakes about one word that stands in many places: the parser reports them once.
+#[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
+pub enum WordMistake {
+    /// A name has letters that names cannot contain.
+    ForeignName,
+    /// A keyword stands in the place of a name.
+    Reserved,
+    /// A word does not fit where it stands.
+    Misfit,
+}
+
 /// One error or warning: the problem, its place, and a suggestion.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub struct Diagnostic {
@@ -45,6 +56,8 @@ pub struct Diagnostic {
     pub help: Option<String>,
     /// Its kind, if it recurs.
     pub recurring: Option<Recurring>,
+    /// Its kind, if it is about the word at its primary place.
+    pub word: Option<WordMistake>,
 }
 
 /// A span with a short text.
@@ -60,7 +73,7 @@ impl Diagnostic {
     /// An error without a span; add one by [`label`](Diagnostic::label).
     pub fn error(code: &'static str, message: impl Into<String>) -> Diagnostic {
         let (severity, message) = (Severity::Error, message.into());
-        Diagnostic { code, severity, message, labels: Vec::new(), help: None, recurring: None }
+        Diagnostic { code, severity, message, labels: Vec::new(), help: None, recurring: None, word: None }
     }
 
     /// A warning without a span.
@@ -83,6 +96,12 @@ impl Diagnostic {
     /// Marks it as one that recurs.
     pub fn recurring(mut self, recurring: Recurring) -> Diagnostic {
         self.recurring = Some(recurring);
+        self
+    }
+
+    /// Marks it as a mistake about the word at its primary place.
+    pub(crate) fn about_word(mut self, mistake: WordMistake) -> Diagnostic {
+        self.word = Some(mistake);
         self
     }
 

@@ -11,7 +11,7 @@ use pest::error::{ErrorVariant, InputLocation};
 use pest::iterators::Pair;
 
 use crate::ast::*;
-use crate::diagnostic::Diagnostic;
+use crate::diagnostic::{Diagnostic, WordMistake};
 use crate::outline::{self, Head};
 use crate::slips;
 use crate::span::{FileId, Span};
@@ -219,15 +219,18 @@ impl<'t> Reader<'t> {
 
     fn finish(mut self) -> Vec<Diagnostic> {
         self.diagnostics.sort_by_key(|diagnostic| diagnostic.span().start);
-        // A name with foreign letters is an error at each use; reported once.
-        let mut names = HashSet::new();
-        self.diagnostics.retain(|d| !d.message.ends_with(slips::NO_NAME) || names.insert(d.message.clone()));
-        // A keyword as a name is reported at its declaration, not at its uses.
-        let reserved = |d: &Diagnostic| d.message.strip_suffix(slips::RESERVED).map(str::to_string);
-        let words: HashSet<String> = self.diagnostics.iter().filter_map(reserved).collect();
-        let misfit = |d: &Diagnostic| d.message.strip_suffix(slips::MISFIT).is_some_and(|word| words.contains(word));
+        let text = self.source.text;
+        let word = |d: &Diagnostic| text.get(d.span().range()).unwrap_or_default();
+        let of = |mistake: WordMistake| move |d: &&Diagnostic| d.word == Some(mistake);
+        let reserved: HashSet<&str> = self.diagnostics.iter().filter(of(WordMistake::Reserved)).map(word).collect();
         let mut seen = HashSet::new();
-        self.diagnostics.retain(|d| !misfit(d) && reserved(d).is_none_or(|word| seen.insert(word)));
+        self.diagnostics.retain(|d| match d.word {
+            // An error at each use of the name; reported once.
+            Some(mistake @ (WordMistake::ForeignName | WordMistake::Reserved)) => seen.insert((mistake, word(d))),
+            // A keyword as a name is reported at its declaration, not at its uses.
+            Some(WordMistake::Misfit) => !reserved.contains(word(d)),
+            None => true,
+        });
         self.diagnostics.truncate(DIAGNOSTIC_LIMIT);
         self.diagnostics
     }

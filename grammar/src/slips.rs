@@ -3,7 +3,7 @@
 //! In: the marks of one statement and the position at which parsing stopped. Out: one diagnostic in terms of the text.
 //! Knows nothing of grammar rules; the expected tokens come as words.
 
-use crate::diagnostic::Diagnostic;
+use crate::diagnostic::{Diagnostic, WordMistake};
 use crate::span::Span;
 use crate::split::{Piece, Source};
 use crate::tokens::{TokenKind, is_keyword};
@@ -200,9 +200,6 @@ fn character(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
     Some(Diagnostic::error("E0001", format!("{shown} has no place here")).label(source.span(at), "").help(instead))
 }
 
-/// Ending of the message about a name with foreign letters.
-pub(crate) const NO_NAME: &str = "is no name here";
-
 /// Reports a name with letters that names cannot contain: the whole name, and how it can be written.
 fn foreign(source: &Source, piece: Piece, at: usize) -> Diagnostic {
     let letters = |at: usize| {
@@ -223,12 +220,14 @@ fn foreign(source: &Source, piece: Piece, at: usize) -> Diagnostic {
         .map(|c| if c.is_ascii() { Some(c.to_string()) } else { plain_letters(c).map(str::to_string) })
         .collect();
     let made_of = "names are made of the letters a to z, digits and `_`";
-    Diagnostic::error("E0001", format!("`{word}` {NO_NAME}")).label(source.span(first).to(source.span(last)), "").help(
-        match plain {
-            Some(plain) => format!("write `{plain}`: {made_of}"),
-            None => format!("{made_of}: `sigma0`, `omega`"),
-        },
-    )
+    let help = match plain {
+        Some(plain) => format!("write `{plain}`: {made_of}"),
+        None => format!("{made_of}: `sigma0`, `omega`"),
+    };
+    Diagnostic::error("E0001", format!("`{word}` is no name here"))
+        .label(source.span(first).to(source.span(last)), "")
+        .help(help)
+        .about_word(WordMistake::ForeignName)
 }
 
 /// A letter of another alphabet, transliterated to ASCII.
@@ -614,10 +613,6 @@ fn branch(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
     )
 }
 
-/// Endings of the messages about a keyword in the place of a name, and about a token that does not fit.
-pub(crate) const RESERVED: &str = " is a word of the language";
-pub(crate) const MISFIT: &str = " does not fit here";
-
 /// Reports a keyword in the place of a name.
 fn reserved(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
     let at = stop.at;
@@ -628,7 +623,8 @@ fn reserved(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
     let named = stop.expected.iter().any(|expected| expected == "a name");
     let value = stop.expected.iter().any(|expected| expected == "a value");
     (named || value && !matches!(word, "then" | "else" | "in" | "and" | "or")).then(|| {
-        Diagnostic::error("E0001", format!("`{word}`{RESERVED}"))
+        Diagnostic::error("E0001", format!("`{word}` is a word of the language"))
+            .about_word(WordMistake::Reserved)
             .label(source.span(at), if named { "expected a name" } else { "expected a value" })
             .help(format!("as a name write for example `{word}_`"))
     })
@@ -791,7 +787,9 @@ fn plain(source: &Source, piece: Piece, stop: &Stop) -> Diagnostic {
     }
     let found = source.word(stop.at);
     let shown: String = found.chars().take(30).collect();
-    Diagnostic::error("E0001", format!("`{shown}`{MISFIT}")).label(source.span(stop.at), wanted)
+    Diagnostic::error("E0001", format!("`{shown}` does not fit here"))
+        .label(source.span(stop.at), wanted)
+        .about_word(WordMistake::Misfit)
 }
 
 /// The operand that ends before `at`, if it is short enough for a message.

@@ -231,9 +231,9 @@ impl<'a> Flattener<'a> {
                     let value = unit.to_si(value);
                     if env.rotary {
                         if unit.angle == Angle::Angle {
-                            self.not_rotary(env.instance, span, "speaks of an angle already");
+                            self.not_rotary(env.instance, span, NotRotary::Angle);
                         } else if env.equation && unit.dimension.rotary() != unit.dimension {
-                            self.not_rotary(env.instance, span, "a constant with a straight unit inside an equation");
+                            self.not_rotary(env.instance, span, NotRotary::StraightConstant);
                         }
                     }
                     let dimension = if env.rotary { unit.dimension.rotary() } else { unit.dimension };

@@ -297,7 +297,7 @@ impl<'a> Flattener<'a> {
         match Unit::parse(&unit.text) {
             Ok(parsed) => {
                 if rotary && parsed.angle == Angle::Angle {
-                    self.not_rotary(owner, unit.span, "speaks of an angle already");
+                    self.not_rotary(owner, unit.span, NotRotary::Angle);
                     return None;
                 }
                 Some(if rotary { parsed.rotary() } else { parsed })
@@ -309,20 +309,24 @@ impl<'a> Flattener<'a> {
         }
     }
 
-    pub(super) fn not_rotary(&mut self, owner: Option<InstanceId>, span: Span, why: &str) {
+    pub(super) fn not_rotary(&mut self, owner: Option<InstanceId>, span: Span, why: NotRotary) {
         if let Some(id) = owner {
             if self.system.strangers.contains(&id) {
                 return;
             }
             self.system.strangers.push(id);
         }
-        let help = match why.contains("speaks of an angle") {
-            true => "leave out `rotary`: a model in rad and N·m is rotary as it is, and fits a rotary slot",
-            false => {
-                "`rotary` maps m to rad and kg to kg·m^2 throughout: only a model in straight units has a rotary twin"
-            }
+        let (label, help) = match why {
+            NotRotary::Angle => (
+                "speaks of an angle already",
+                "leave out `rotary`: a model in rad and N·m is rotary as it is, and fits a rotary slot",
+            ),
+            NotRotary::StraightConstant => (
+                "a constant with a straight unit inside an equation",
+                "`rotary` maps m to rad and kg to kg·m^2 throughout: only a model in straight units has a rotary twin",
+            ),
         };
-        let error = Diagnostic::error("E0109", "this model cannot be made rotary").label(span, why).help(help);
+        let error = Diagnostic::error("E0109", "this model cannot be made rotary").label(span, label).help(help);
         self.report(error);
     }
 

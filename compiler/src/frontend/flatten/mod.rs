@@ -36,6 +36,15 @@ const MOST_MISTAKES: usize = 1000;
 /// Limit on the nesting of parts and of function calls.
 const DEEPEST: usize = 64;
 
+/// Why a model has no rotary twin.
+#[derive(Clone, Copy)]
+enum NotRotary {
+    /// A unit has an angle already.
+    Angle,
+    /// An equation has a constant with a straight unit.
+    StraightConstant,
+}
+
 /// Input of flattening: a model with arguments, as an experiment or a check requires it.
 pub struct Request<'a> {
     /// The model and how its inputs are supplied.
