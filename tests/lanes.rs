@@ -105,13 +105,11 @@ fn in_lanes_and_alone(varying: &Varying, path: &str, values: &[f64]) -> Vec<Resu
 /// Mutants tried by hand, each fails with seed 1: every run of a sweep starts where the first one does (`fit`); the
 /// initial value stays as written although it is varied; sampled states cannot be varied (`starts::open`).
 #[test]
+#[cfg_attr(not(target_arch = "x86_64"), ignore = "lanes are for x86-64")]
 fn start_values_share_their_lanes() {
     let from =
         |name: &str, otherwise: u64| std::env::var(name).ok().and_then(|value| value.parse().ok()).unwrap_or(otherwise);
     let (seed, draws) = (from("FRIC_SEED", 1), from("FRIC_RUNS", 16));
-    if !has_lanes() {
-        return;
-    }
     let mut random = Random(seed);
     let mut apart = 0;
     for draw in 0..draws {
@@ -162,13 +160,11 @@ fn compiled(experiment: &str, changes: Changes) -> Case {
 }
 
 #[test]
+#[cfg_attr(not(target_arch = "x86_64"), ignore = "lanes are for x86-64")]
 fn adaptive_runs_share_their_lanes() {
     for (experiment, path) in
         [("last", "fr.Fs"), ("measured", "fr.Fs"), ("regimes", "fr.Fs"), ("narrow", "fr.Fs"), ("sampled", "Kp")]
     {
-        if !has_lanes() {
-            return;
-        }
         let varying = varying(experiment, path, None);
         let failed = compare(&varying, path, 30, if path == "Kp" { 15.0 } else { 1.1 }, 0.02);
         assert_eq!(failed, 0, "{experiment}");
@@ -176,12 +172,10 @@ fn adaptive_runs_share_their_lanes() {
 }
 
 #[test]
+#[cfg_attr(not(target_arch = "x86_64"), ignore = "lanes are for x86-64")]
 fn fixed_steps_share_their_lanes() {
     for (experiment, path) in [("last", "fr.Fs"), ("measured", "fr.Fs"), ("regimes", "fr.Fs"), ("sampled", "Kp")] {
         for method in [Method::Expo, Method::Implicit, Method::Rk4] {
-            if !has_lanes() {
-                return;
-            }
             let step = if method == Method::Rk4 { 1e-4 } else { 1e-3 };
             let varying = varying(experiment, path, Some((method, step)));
             compare(&varying, path, 40, if path == "Kp" { 15.0 } else { 1.1 }, 0.02);
@@ -190,10 +184,8 @@ fn fixed_steps_share_their_lanes() {
 }
 
 #[test]
+#[cfg_attr(not(target_arch = "x86_64"), ignore = "lanes are for x86-64")]
 fn a_run_that_fails_leaves_the_others_alone() {
-    if !has_lanes() {
-        return;
-    }
     for solver in [None, Some((Method::Expo, 1e-3))] {
         for experiment in ["last", "measured"] {
             let varying = varying(experiment, "speed", solver);
@@ -201,12 +193,4 @@ fn a_run_that_fails_leaves_the_others_alone() {
             assert!((5..25).contains(&failed), "{experiment}: {failed} of 30 leave the range of v");
         }
     }
-}
-
-fn has_lanes() -> bool {
-    let here = compiler::codegen::lanes::Width::here().is_some();
-    if !here {
-        println!("SKIPPED: this processor has no lanes: each run is alone");
-    }
-    here
 }

@@ -32,13 +32,14 @@ fn open(name: &str) -> SocketCan {
     SocketCan::open(name, &Options::default(), Monotonic::new()).expect("it is up")
 }
 
-/// Whether this is the virtual machine of `tests/can`, with its cards. Elsewhere only virtual interfaces can be tested.
-fn guest() -> bool {
+/// The cards of the virtual machine of `tests/can`, for one test at a time.
+///
+/// # Panics
+/// On another machine: what cannot run must not pass.
+fn cards() -> std::sync::MutexGuard<'static, ()> {
     let guest = std::env::var("GUEST").is_ok();
-    if !guest {
-        eprintln!("no cards here; `tests/can/guest --cards` has them");
-    }
-    guest
+    assert!(guest, "needs two CAN cards: without FRIC_CAN=host these tests run in the guest that has them");
+    CARDS.lock().unwrap_or_else(std::sync::PoisonError::into_inner)
 }
 
 #[test]
@@ -59,10 +60,7 @@ fn a_virtual_interface_keeps_the_contract() {
 
 #[test]
 fn two_cards_keep_the_contract() {
-    if !guest() {
-        return;
-    }
-    let _cards = CARDS.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
+    let _cards = cards();
     contract::check("SJA1000", &|options| {
         for name in ["can0", "can1"] {
             // Down first: a bit rate can be set only before an interface is up.
@@ -96,10 +94,7 @@ fn an_interface_is_compared_and_never_set() {
     socketcan::take_down(&name).expect("we may");
     assert!(refused(&name, RATE).contains(&format!("it is down\n  mend: ip link set {name} up")));
 
-    if !guest() {
-        return;
-    }
-    let _cards = CARDS.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
+    let _cards = cards();
     socketcan::take_down("can0").expect("we may");
     socketcan::take_up("can0", Some(500_000)).expect("the driver is loaded");
     let said = refused("can0", RATE);
@@ -204,10 +199,7 @@ fn prepared_frames_arrive() {
 /// Frames faster than they can be read, through two cards. Every missing frame has been reported.
 #[test]
 fn a_flood_is_read_or_its_loss_is_reported() {
-    if !guest() {
-        return;
-    }
-    let _cards = CARDS.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
+    let _cards = cards();
     for name in ["can0", "can1"] {
         socketcan::take_down(name).expect("we may");
         socketcan::take_up(name, Some(RATE)).expect("the driver is loaded");
@@ -292,9 +284,7 @@ fn through_a_gateway(changed: impl Fn(&str, &str)) -> (Cause, u64) {
 /// that goes down.
 #[test]
 fn a_rig_stops_when_the_kernel_drops_or_rewrites_its_frames() {
-    if !guest() {
-        return;
-    }
+    let _cards = cards();
     let (cause, after) = through_a_gateway(|near, far| {
         let all_but = ["-A", "-e", "-s", far, "-d", near, "-f", "183~7FF"];
         gateway(&[&["-A", "-e", "-s", near, "-d", far], &all_but]);
