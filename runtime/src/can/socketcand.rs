@@ -279,19 +279,19 @@ impl Server {
         let (tcp, _) = self.listener.accept().ok()?;
         let mut stream = Stream::new(tcp, self.clock).ok()?;
         stream.say(b"< hi >").ok()?;
-        Some(Connection { stream, stage: Stage::Greeted })
+        Some(Connection { stream, phase: Phase::Greeted })
     }
 }
 
 /// A connected client.
 pub struct Connection {
     stream: Stream,
-    stage: Stage,
+    phase: Phase,
 }
 
 /// Progress of the handshake.
 #[derive(Clone, Copy, PartialEq)]
-enum Stage {
+enum Phase {
     Greeted,
     /// The client may send, and receives nothing.
     Opened,
@@ -306,20 +306,20 @@ impl Connection {
         let message = self.stream.incoming.message(|byte| byte == b'>')?;
         let text = std::str::from_utf8(message).unwrap_or_default().trim_start_matches(['<', ' ', '\n', '\r']);
         let mut words = text.split_ascii_whitespace();
-        let answer: &[u8] = match (words.next(), self.stage) {
-            (Some("open"), Stage::Greeted) if words.next().is_some() => {
-                self.stage = Stage::Opened;
+        let answer: &[u8] = match (words.next(), self.phase) {
+            (Some("open"), Phase::Greeted) if words.next().is_some() => {
+                self.phase = Phase::Opened;
                 b"< ok >"
             }
-            (Some("rawmode"), Stage::Opened) => {
-                self.stage = Stage::Raw(now_ns + PAUSE_NS);
+            (Some("rawmode"), Phase::Opened) => {
+                self.phase = Phase::Raw(now_ns + PAUSE_NS);
                 b"< ok >"
             }
             (Some("echo"), _) => b"< echo >",
-            (Some("send"), Stage::Opened | Stage::Raw(_)) => match decode_send(words) {
+            (Some("send"), Phase::Opened | Phase::Raw(_)) => match decode_send(words) {
                 Some(frame) => {
                     // A client that sends has read the answers: frames may follow immediately.
-                    if let Stage::Raw(from_ns) = &mut self.stage {
+                    if let Phase::Raw(from_ns) = &mut self.phase {
                         *from_ns = 0;
                     }
                     return Some(Some(frame));
@@ -336,10 +336,10 @@ impl Connection {
 
 impl Bus for Connection {
     fn send(&mut self, frame: Frame) -> Result<(), Refused> {
-        match self.stage {
-            Stage::Raw(from_ns) if self.stream.clock.now_ns() >= from_ns => {}
+        match self.phase {
+            Phase::Raw(from_ns) if self.stream.clock.now_ns() >= from_ns => {}
             // The client does not receive yet.
-            Stage::Greeted | Stage::Opened | Stage::Raw(_) => return Ok(()),
+            Phase::Greeted | Phase::Opened | Phase::Raw(_) => return Ok(()),
         }
         if frame.is_remote() {
             return Err(Refused::Unable);

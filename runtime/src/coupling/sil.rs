@@ -32,7 +32,7 @@ struct Path {
 }
 
 /// A signal that the control program reads.
-struct Reading {
+struct Sensed {
     to: Slot,
     from: From,
 }
@@ -171,7 +171,7 @@ fn in_steps(value: f64, step: f64) -> f64 {
 }
 
 /// Passes every signal to the control program.
-fn read(control: &mut Instance, plant: &Instance, readings: &[Reading], paths: &[Path]) {
+fn read(control: &mut Instance, plant: &Instance, readings: &[Sensed], paths: &[Path]) {
     for reading in readings {
         let value = match &reading.from {
             From::Part(slot, step, true) => (plant.get(*slot) / step).floor() * step,
@@ -223,7 +223,7 @@ fn paths(rig: &Rig) -> Vec<Path> {
     rig.outputs.iter().map(one).collect()
 }
 
-fn readings(rig: &Rig, paths: &[Path]) -> Vec<Reading> {
+fn readings(rig: &Rig, paths: &[Path]) -> Vec<Sensed> {
     let one = |input: &abi::rig::Input| {
         let seen = rig.plant.seen.iter().find(|(signal, _)| *signal == input.signal);
         let applied = paths.iter().position(|path| path.signal == input.signal);
@@ -234,7 +234,7 @@ fn readings(rig: &Rig, paths: &[Path]) -> Vec<Reading> {
             (None, None, What::Enabled) => From::Constant(1.0),
             (None, None, _) => From::Constant(input.start),
         };
-        Reading { to: input.slot, from }
+        Sensed { to: input.slot, from }
     };
     rig.inputs.iter().map(one).collect()
 }

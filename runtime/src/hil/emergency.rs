@@ -360,8 +360,7 @@ mod tests {
             let _table = prepare(vec![Prepared::new(file.as_raw_fd(), b"stop;")]);
             // A thread whose handler stack is not the one that Rust's runtime installed.
             guard();
-            println!("{}", deeper(0));
-            return;
+            return println!("{}", deeper(0));
         }
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("frames");

@@ -176,8 +176,7 @@ fn however_a_process_ends_its_stop_frames_reach_its_buses_and_nothing_else() {
         let thread = std::thread::Builder::new().stack_size(STACK);
         let ends = thread.spawn(move || child(&Ending::of(seed), Path::new(&folder))).unwrap().join();
         // A panic ends only the thread.
-        assert!(ends.is_ok(), "the cycle has failed");
-        return;
+        return assert!(ends.is_ok(), "the cycle has failed");
     }
     let seeds = seeds(RUNS);
     let failed: Vec<String> = seeds.filter_map(|seed| run(seed).err()).collect();
