@@ -115,17 +115,23 @@ impl Instance {
     /// Starts the model at t = 0 for steps of `h` seconds: initial values and the sampled blocks due at 0, then
     /// transitions until none applies (at most as often as an automaton has regimes), then outputs.
     pub fn start(&mut self, h: f64) -> u64 {
+        let mut regimes = vec![0.0; self.description.layout.regimes.len as usize];
+        self.start_in(h, &mut regimes)
+    }
+
+    /// The same without an allocation. `regimes`: room for all regimes.
+    pub fn start_in(&mut self, h: f64, regimes: &mut [f64]) -> u64 {
         self.set(Slot::TIME, 0.0);
         self.set(Slot::COUNT, 0.0);
         self.set(Slot::STEP, h);
         let mut status = self.call(Function::Start);
         if self.has(Function::Transitions) {
-            let regimes = self.description.layout.regimes.range();
+            let range = self.description.layout.regimes.range();
             let most = self.description.automata.iter().map(|automaton| automaton.regimes.len()).max().unwrap_or(0);
             for _ in 0..=most {
-                let before = self.block()[regimes.clone()].to_vec();
+                regimes.copy_from_slice(&self.block()[range.clone()]);
                 status = status.max(self.call(Function::Transitions));
-                if self.block()[regimes.clone()] == before[..] {
+                if self.block()[range.clone()] == *regimes {
                     break;
                 }
             }

@@ -7,6 +7,7 @@ pub mod frame_length;
 
 pub mod address;
 pub mod descriptor;
+mod text_stream;
 
 pub mod sim;
 

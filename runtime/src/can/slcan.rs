@@ -10,8 +10,9 @@
 //! by BEL.
 
 use super::address::SLCAN_BIT_RATES;
-use super::descriptor::{self, Incoming, Moved, Outgoing};
-use super::{Bus, CannotOpen, Event, Filter, Frame, Health, Options, Prepared, Received, Refused, State};
+use super::descriptor;
+use super::text_stream::{Shape, TextStream};
+use super::{Bus, CannotOpen, Filter, Frame, Health, Options, Prepared, Received, Refused, State};
 use crate::realtime::clock::{Clock, Monotonic};
 use std::fs::{File, OpenOptions};
 use std::io;
@@ -38,14 +39,9 @@ fn is_end(byte: u8) -> bool {
 
 /// One end of a terminal.
 pub struct Slcan {
-    fd: OwnedFd,
-    clock: Monotonic,
+    stream: TextStream<OwnedFd>,
     side: Side,
     filter: Filter,
-    incoming: Incoming,
-    outgoing: Outgoing,
-    health: Health,
-    down_told: bool,
 }
 
 enum Side {
@@ -102,8 +98,8 @@ impl Slcan {
         let mut bus = Slcan::new(file.into(), clock, side, options.filter.clone());
         // An empty line terminates any partial line; the bus is closed first, because an open bus refuses a bit rate.
         let open = if options.listen_only { 'L' } else { 'O' };
-        bus.outgoing.push(format!("\r\rC\rS{code}\r{open}\r").as_bytes());
-        bus.outgoing.flush(bus.fd.as_raw_fd());
+        bus.stream.outgoing.push(format!("\r\rC\rS{code}\r{open}\r").as_bytes());
+        bus.stream.flush();
         Ok(bus)
     }
 
@@ -134,8 +130,8 @@ impl Slcan {
     }
 
     fn new(fd: OwnedFd, clock: Monotonic, side: Side, filter: Filter) -> Slcan {
-        let (incoming, outgoing) = (Incoming::new(INCOMING), Outgoing::new(OUTGOING));
-        Slcan { fd, clock, side, filter, incoming, outgoing, health: Health::default(), down_told: false }
+        let shape = Shape { is_end, unfinished: 4 * LINE, incoming: INCOMING, outgoing: OUTGOING };
+        Slcan { stream: TextStream::new(fd, clock, shape), side, filter }
     }
 
     /// Path of the computer's end of a door.
@@ -146,17 +142,11 @@ impl Slcan {
         }
     }
 
-    fn down(&mut self) -> Option<Received> {
-        self.health.state = State::Down;
-        let told = std::mem::replace(&mut self.down_told, true);
-        (!told).then(|| Received::Event(Event::Down, self.clock.now_ns()))
-    }
-
     /// The next frame among the received lines; an adapter executes and answers commands on the way.
     fn next(&mut self) -> Option<Received> {
         loop {
-            let now_ns = self.clock.now_ns();
-            let line = self.incoming.message(is_end)?;
+            let now_ns = self.stream.clock.now_ns();
+            let line = self.stream.incoming.message(is_end)?;
             // Answers to frames precede the next frame without a separator.
             let line = line.trim_ascii_start();
             let frame = decode(line);
@@ -170,8 +160,8 @@ impl Slcan {
                     let answer: &[u8] = match (frame, line) {
                         (Some(frame), _) if adapter.open && !adapter.listen_only => {
                             let answer = if frame.is_extended() { b"Z\r" } else { b"z\r" };
-                            if !self.outgoing.push(answer) {
-                                self.health.refused += 1;
+                            if !self.stream.outgoing.push(answer) {
+                                self.stream.health.refused += 1;
                             }
                             return Some(Received::Frame(frame, now_ns));
                         }
@@ -179,7 +169,7 @@ impl Slcan {
                         (None, line) => adapter.command(line),
                     };
                     // An answer that does not fit is for a computer that reads nothing.
-                    self.outgoing.push(answer);
+                    self.stream.outgoing.push(answer);
                 }
             }
         }
@@ -223,62 +213,42 @@ impl Bus for Slcan {
         let stamp = match &self.side {
             // Nobody has opened the bus, so the frame has no recipient.
             Side::Adapter(adapter) if !adapter.open => return Ok(()),
-            Side::Adapter(adapter) => adapter.stamps.then(|| (self.clock.now_ns() / 1_000_000 % 60_000) as u16),
+            Side::Adapter(adapter) => adapter.stamps.then(|| (self.stream.clock.now_ns() / 1_000_000 % 60_000) as u16),
             Side::Computer { listen_only: true } => return Err(Refused::Unable),
             Side::Computer { listen_only: false } => None,
         };
         let mut line = [0; LINE];
         let length = encode(&frame, stamp, &mut line);
-        let there = self.outgoing.flush(self.fd.as_raw_fd());
-        let taken = there && self.outgoing.push(&line[..length]);
-        if !there || !self.outgoing.flush(self.fd.as_raw_fd()) {
-            self.health.state = State::Down;
-            self.health.refused += 1;
-            return Err(Refused::Down);
-        }
-        if !taken {
-            self.health.refused += 1;
-            return Err(Refused::Full);
-        }
-        Ok(())
+        self.stream.send(&line[..length])
     }
 
     fn receive(&mut self) -> Option<Received> {
-        let received = self.next().or_else(|| match self.incoming.fill(self.fd.as_raw_fd()) {
-            Moved::Bytes(_) => {
-                let received = self.next();
-                // A line of excessive length without an end is discarded.
-                if received.is_none() && self.incoming.unfinished() > 4 * LINE {
-                    self.incoming.discard();
-                    self.health.lost += 1;
-                    return Some(Received::Event(Event::Lost(1), self.clock.now_ns()));
-                }
-                received
+        let received = loop {
+            if let Some(received) = self.next().or_else(|| self.stream.tidy()) {
+                break Some(received);
             }
-            Moved::Later => None,
-            Moved::Gone => self.down(),
-        });
-        if !self.outgoing.is_empty() && !self.outgoing.flush(self.fd.as_raw_fd()) {
-            self.health.state = State::Down;
+            match self.stream.fill() {
+                Ok(true) => {}
+                Ok(false) => break None,
+                Err(gone) => break gone,
+            }
+        };
+        if !self.stream.outgoing.is_empty() && !self.stream.flush() {
+            self.stream.health.state = State::Down;
         }
         received
     }
 
     fn wait(&mut self, until_ns: u64) -> bool {
-        if self.down_told {
-            self.clock.sleep_until(until_ns);
-            return false;
-        }
-        self.incoming.has_message(is_end)
-            || descriptor::wait_stream(self.fd.as_raw_fd(), &mut self.outgoing, &self.clock, until_ns)
+        self.stream.wait(until_ns)
     }
 
     fn health(&self) -> Health {
-        self.health
+        self.stream.health
     }
 
     fn descriptor(&self) -> Option<RawFd> {
-        Some(self.fd.as_raw_fd())
+        Some(self.stream.fd())
     }
 
     /// Begins with an empty line, which terminates a partially written line.
@@ -287,7 +257,7 @@ impl Bus for Slcan {
         let mut text = [0; LINE];
         let length = encode(&frame, None, &mut text);
         line[1..=length].copy_from_slice(&text[..length]);
-        Some(Prepared::new(self.fd.as_raw_fd(), &line[..=length]))
+        Some(Prepared::new(self.stream.fd(), &line[..=length]))
     }
 }
 
@@ -295,8 +265,8 @@ impl Drop for Slcan {
     fn drop(&mut self) {
         match &self.side {
             Side::Computer { .. } => {
-                self.outgoing.push(b"C\r");
-                self.outgoing.flush(self.fd.as_raw_fd());
+                self.stream.outgoing.push(b"C\r");
+                self.stream.flush();
             }
             Side::Adapter(Adapter { link: Some(link), path, .. }) => {
                 // Another process may have replaced the link.

@@ -6,8 +6,8 @@
 //! The server sends `< hi >`; the client sends `< open can0 >` and `< rawmode >`, each answered by `< ok >`. Then the
 //! client sends frames as `< send 123 2 aa b >` and receives them as `< frame 123 1700000000.123456 AABB >`.
 
-use super::descriptor::{self, Incoming, Moved, Outgoing};
-use super::{Bus, CannotOpen, Event, Filter, Frame, Health, Options, Prepared, Received, Refused, State};
+use super::text_stream::{Shape, TextStream};
+use super::{Bus, CannotOpen, Filter, Frame, Health, Options, Prepared, Received, Refused};
 use crate::realtime::clock::{Clock, Monotonic};
 use std::io::{self, Cursor, Read, Write};
 use std::net::{TcpListener, TcpStream, ToSocketAddrs};
@@ -33,94 +33,43 @@ const PATIENCE: Duration = Duration::from_secs(2);
 /// compare it as a whole, so that a frame right after it would break the handshake.
 const PAUSE_NS: u64 = 20_000_000;
 
-/// A TCP stream with the state that both ends need.
-struct Stream {
-    tcp: TcpStream,
-    clock: Monotonic,
-    incoming: Incoming,
-    outgoing: Outgoing,
-    health: Health,
-    down_told: bool,
+/// A TCP stream of messages.
+type Stream = TextStream<TcpStream>;
+
+fn is_end(byte: u8) -> bool {
+    byte == b'>'
 }
 
-impl Stream {
-    fn new(tcp: TcpStream, clock: Monotonic) -> io::Result<Stream> {
-        tcp.set_nonblocking(true)?;
-        tcp.set_nodelay(true)?;
-        let (incoming, outgoing) = (Incoming::new(INCOMING), Outgoing::new(OUTGOING));
-        let stream = Stream { tcp, clock, incoming, outgoing, health: Health::default(), down_told: false };
-        stream.acknowledge_at_once();
-        Ok(stream)
-    }
+fn stream_of(tcp: TcpStream, clock: Monotonic) -> io::Result<Stream> {
+    tcp.set_nonblocking(true)?;
+    tcp.set_nodelay(true)?;
+    acknowledge_at_once(&tcp);
+    Ok(TextStream::new(tcp, clock, Shape { is_end, unfinished: UNFINISHED, incoming: INCOMING, outgoing: OUTGOING }))
+}
 
-    /// Requests an immediate TCP acknowledgement, because the other end may hold back its next message until then. The
-    /// kernel delays acknowledgements unless this is requested after every read: 44 ms become 0.3.
-    fn acknowledge_at_once(&self) {
-        let on: libc::c_int = 1;
-        // SAFETY: the option is valid for its length and outlives the call. A refusal only costs time.
-        unsafe {
-            libc::setsockopt(
-                self.tcp.as_raw_fd(),
-                libc::IPPROTO_TCP,
-                libc::TCP_QUICKACK,
-                (&raw const on).cast(),
-                size_of_val(&on) as libc::socklen_t,
-            )
-        };
-    }
+/// Requests an immediate TCP acknowledgement, because the other end may hold back its next message until then. The
+/// kernel delays acknowledgements unless this is requested after every read: 44 ms become 0.3.
+fn acknowledge_at_once(tcp: &TcpStream) {
+    let on: libc::c_int = 1;
+    // SAFETY: the option is valid for its length and outlives the call. A refusal only costs time.
+    unsafe {
+        libc::setsockopt(
+            tcp.as_raw_fd(),
+            libc::IPPROTO_TCP,
+            libc::TCP_QUICKACK,
+            (&raw const on).cast(),
+            size_of_val(&on) as libc::socklen_t,
+        )
+    };
+}
 
-    /// Reads more bytes; the loss of the connection is returned as an event.
-    fn fill(&mut self) -> Result<bool, Option<Received>> {
-        match self.incoming.fill(self.tcp.as_raw_fd()) {
-            Moved::Bytes(_) => {
-                self.acknowledge_at_once();
-                Ok(true)
-            }
-            Moved::Later => Ok(false),
-            Moved::Gone => Err(self.down()),
-        }
+/// Reads more bytes; the loss of the connection is returned as an event.
+fn fill(stream: &mut Stream) -> Result<bool, Option<Received>> {
+    let filled = stream.fill()?;
+    if filled {
+        acknowledge_at_once(&stream.descriptor);
     }
-
-    /// Discards bytes that cannot become a message any more.
-    fn tidy(&mut self) -> Option<Received> {
-        (self.incoming.unfinished() > UNFINISHED).then(|| {
-            self.incoming.discard();
-            self.health.lost += 1;
-            Received::Event(Event::Lost(1), self.clock.now_ns())
-        })
-    }
-
-    fn down(&mut self) -> Option<Received> {
-        self.health.state = State::Down;
-        let told = std::mem::replace(&mut self.down_told, true);
-        (!told).then(|| Received::Event(Event::Down, self.clock.now_ns()))
-    }
-
-    /// Sends a whole message or nothing.
-    fn say(&mut self, message: &[u8]) -> Result<(), Refused> {
-        let fd = self.tcp.as_raw_fd();
-        let there = self.outgoing.flush(fd);
-        let taken = there && self.outgoing.push(message);
-        if !there || !self.outgoing.flush(fd) {
-            self.health.state = State::Down;
-            self.health.refused += 1;
-            return Err(Refused::Down);
-        }
-        if !taken {
-            self.health.refused += 1;
-            return Err(Refused::Full);
-        }
-        Ok(())
-    }
-
-    fn wait(&mut self, until_ns: u64) -> bool {
-        if self.down_told {
-            self.clock.sleep_until(until_ns);
-            return false;
-        }
-        self.incoming.has_message(|byte| byte == b'>')
-            || descriptor::wait_stream(self.tcp.as_raw_fd(), &mut self.outgoing, &self.clock, until_ns)
-    }
+    Ok(filled)
 }
 
 /// A connection to a gateway.
@@ -147,7 +96,7 @@ impl Client {
             let quiet = |error: io::Error| error.to_string();
             emergency.set_nodelay(true).map_err(quiet)?;
             emergency.set_nonblocking(true).map_err(quiet)?;
-            let stream = Stream::new(stream, clock).map_err(quiet)?;
+            let stream = stream_of(stream, clock).map_err(quiet)?;
             Ok(Client { stream, filter: options.filter.clone(), listen_only: options.listen_only, emergency })
         };
         connect().map_err(|reason| CannotOpen {
@@ -202,12 +151,12 @@ impl Bus for Client {
         }
         let mut message = [0; MESSAGE];
         let length = encode_send(&frame, &mut message);
-        self.stream.say(&message[..length])
+        self.stream.send(&message[..length])
     }
 
     fn receive(&mut self) -> Option<Received> {
         loop {
-            while let Some(message) = self.stream.incoming.message(|byte| byte == b'>') {
+            while let Some(message) = self.stream.incoming.message(is_end) {
                 if let Some(frame) = decode_frame(message).filter(|frame| self.filter.accepts(frame)) {
                     return Some(Received::Frame(frame, self.stream.clock.now_ns()));
                 }
@@ -215,7 +164,7 @@ impl Bus for Client {
             if let Some(lost) = self.stream.tidy() {
                 return Some(lost);
             }
-            match self.stream.fill() {
+            match fill(&mut self.stream) {
                 Ok(true) => {}
                 Ok(false) => return None,
                 Err(gone) => return gone,
@@ -232,7 +181,7 @@ impl Bus for Client {
     }
 
     fn descriptor(&self) -> Option<RawFd> {
-        Some(self.stream.tcp.as_raw_fd())
+        Some(self.stream.fd())
     }
 
     fn prepare(&self, frame: Frame) -> Option<Prepared> {
@@ -277,8 +226,8 @@ impl Server {
     /// The next client, if one has connected.
     pub fn accept(&mut self) -> Option<Connection> {
         let (tcp, _) = self.listener.accept().ok()?;
-        let mut stream = Stream::new(tcp, self.clock).ok()?;
-        stream.say(b"< hi >").ok()?;
+        let mut stream = stream_of(tcp, self.clock).ok()?;
+        stream.send(b"< hi >").ok()?;
         Some(Connection { stream, phase: Phase::Greeted })
     }
 }
@@ -303,7 +252,7 @@ impl Connection {
     /// Executes a message; returns its frame, if it has one.
     fn heard(&mut self) -> Option<Option<Frame>> {
         let now_ns = self.stream.clock.now_ns();
-        let message = self.stream.incoming.message(|byte| byte == b'>')?;
+        let message = self.stream.incoming.message(is_end)?;
         let text = std::str::from_utf8(message).unwrap_or_default().trim_start_matches(['<', ' ', '\n', '\r']);
         let mut words = text.split_ascii_whitespace();
         let answer: &[u8] = match (words.next(), self.phase) {
@@ -329,7 +278,7 @@ impl Connection {
             _ => b"< error unknown command >",
         };
         // An answer that does not fit is for a client that reads nothing.
-        let _ = self.stream.say(answer);
+        let _ = self.stream.send(answer);
         Some(None)
     }
 }
@@ -346,7 +295,7 @@ impl Bus for Connection {
         }
         let mut message = [0; MESSAGE];
         let length = encode_frame(&frame, &mut message);
-        self.stream.say(&message[..length])
+        self.stream.send(&message[..length])
     }
 
     fn receive(&mut self) -> Option<Received> {
@@ -359,10 +308,10 @@ impl Bus for Connection {
             if let Some(lost) = self.stream.tidy() {
                 return Some(lost);
             }
-            match self.stream.fill() {
+            match fill(&mut self.stream) {
                 Ok(true) => {}
                 Ok(false) => {
-                    self.stream.outgoing.flush(self.stream.tcp.as_raw_fd());
+                    self.stream.flush();
                     return None;
                 }
                 Err(gone) => return gone,
@@ -379,7 +328,7 @@ impl Bus for Connection {
     }
 
     fn descriptor(&self) -> Option<RawFd> {
-        Some(self.stream.tcp.as_raw_fd())
+        Some(self.stream.fd())
     }
 }
 

@@ -562,7 +562,7 @@ impl Control {
                 }
             }
         }
-        let begin = if self.running { 0 } else { self.start() };
+        let begin = if self.running { 0 } else { self.model.start_in(self.step, &mut self.regimes) };
         let steps = self.steps * u64::from(told.ticks.max(1));
         let mut status = begin;
         if begin == 0 {
@@ -583,27 +583,6 @@ impl Control {
         if let Some(i) = self.stops.iter().position(|slot| self.model.get(*slot) != 0.0) {
             self.supervisor.trip(Cause::Condition(i));
         }
-    }
-
-    /// Starts the model at t = 0 like [`Instance::start`], but without allocation.
-    fn start(&mut self) -> u64 {
-        self.model.set(Slot::TIME, 0.0);
-        self.model.set(Slot::COUNT, 0.0);
-        self.model.set(Slot::STEP, self.step);
-        let mut status = self.model.call(Function::Start);
-        if self.model.has(Function::Transitions) {
-            let range = self.model.description().layout.regimes.range();
-            let automata = &self.model.description().automata;
-            let most = automata.iter().map(|automaton| automaton.regimes.len()).max().unwrap_or(0);
-            for _ in 0..=most {
-                self.regimes.copy_from_slice(&self.model.block()[range.clone()]);
-                status = status.max(self.model.call(Function::Transitions));
-                if self.model.block()[range.clone()] == self.regimes[..] {
-                    break;
-                }
-            }
-        }
-        status.max(self.model.call(Function::Outputs))
     }
 
     /// Changes a set of parameters without a step in the outputs: the difference is blended out. A set with which the
