@@ -1,7 +1,9 @@
 //! A whole rig: two drives in torque mode with alternating pulses, and the drives themselves.
 
-use abi::rig::{Bus as BusOf, Cia402, Kind, Mode, Node, Output, Overrun, Plant, Rig, Signal, What, Within};
-use abi::series::Method;
+#[path = "../../runtime/src/testing/nodes.rs"]
+mod nodes;
+
+use abi::rig::{Mode, Rig, What};
 use runtime::can::socketcan::SocketCan;
 use runtime::can::{Bus, Options, Received};
 use runtime::drive::Bench;
@@ -10,59 +12,13 @@ use runtime::realtime::clock::{Clock, Monotonic};
 use runtime::realtime::threads::{self, Wishes};
 use std::sync::atomic::{AtomicBool, Ordering};
 
-fn drive(name: &str, node: u8, period_ns: u64) -> Node {
-    let cia402 = Cia402 {
-        node,
-        rated_torque: 4.0,
-        mode: Mode::Torque,
-        count: 2.0 * std::f64::consts::PI / 262_144.0,
-        speed_unit: 0.01 * std::f64::consts::PI / 30.0,
-        max_torque: Some(4.0),
-        max_speed: Some(200.0),
-        travel: None,
-        max_power: None,
-        at_sync: false,
-        profile: "cia402".into(),
-    };
-    let (delay, lag, timeout_ns) = (0.8e-9 * period_ns as f64, 0.6e-3, 3 * period_ns);
-    Node {
-        name: name.into(),
-        bus: 0,
-        kind: Kind::Cia402(cia402),
-        moves: true,
-        delay,
-        lag,
-        timeout_ns,
-        within: Within::default(),
-    }
-}
-
 /// The rig and its program, with this period.
 pub fn pulsed(period_ns: u64) -> Identification {
-    let output = |node| Output {
-        signal: Signal { node, what: What::Torque },
-        slot: abi::Slot::TIME,
-        low: -1.0,
-        high: 1.0,
-        slew: f64::INFINITY,
-        safe: 0.0,
-    };
+    let drive = |name: &str, node| nodes::drive(name, node, Mode::Torque, period_ns);
+    let output = |node| nodes::output(node, What::Torque, abi::Slot::TIME, [-1.0, 1.0]);
     let rig = Rig {
-        name: "gate".into(),
-        period_ns,
-        method: Method::Rk4,
-        steps: 1,
-        buses: vec![BusOf { name: "can0".into(), address: "socketcan:can0".into(), bit_rate: 1_000_000 }],
-        nodes: vec![drive("load", 3, period_ns), drive("servo", 4, period_ns)],
-        inputs: Vec::new(),
         outputs: vec![output(0), output(1)],
-        watchdog_ns: 5 * period_ns,
-        overrun: Overrun::Stop,
-        stops: Vec::new(),
-        record: Vec::new(),
-        predict: None,
-        needs_look: false,
-        plant: Plant { applied: Vec::new(), seen: Vec::new(), inertia: None },
+        ..nodes::rig("gate", "socketcan:can0", period_ns, vec![drive("load", 3), drive("servo", 4)])
     };
     Identification::new(&rig).expect("its drives take torques")
 }

@@ -2,23 +2,12 @@
 
 use crate::chance::{Chance, seeds};
 use compiler::rig::Emulated;
-use runtime::coupling::loop_stability::{Late, Loop, Shaft, Step};
+use runtime::coupling::loop_stability::{Late, Loop};
 
-/// A contact with this natural frequency and damping ratio on an inertia of 1 kg·m², stepped over the next period with
-/// the newest speed: z' = z + T v, F = K z' + B v.
+/// A contact with this natural frequency and damping ratio on an inertia of 1 kg·m².
 fn sampled(contact: Emulated) -> Loop {
     let Emulated { natural, damping_ratio, period, lag } = contact;
-    let (stiffness, damping) = (natural * natural, 2.0 * damping_ratio * natural);
-    let step = Step {
-        states: 1,
-        signals: 1,
-        commands: 1,
-        a: vec![1.0],
-        b: vec![period],
-        c: vec![-stiffness],
-        d: vec![-(stiffness * period + damping)],
-    };
-    Loop { period, step, shaft: Shaft::rigid(1.0), late: vec![Late { dead: 0.0, lag }] }
+    Loop::bristle(1.0, natural * natural, 2.0 * damping_ratio * natural, period, Late { dead: 0.0, lag })
 }
 
 #[test]

@@ -77,6 +77,22 @@ pub struct Loop {
 }
 
 impl Loop {
+    /// The loop of a bristle contact that sticks, on one inertia: z' = z + T v with the newest speed, F = σ0 z' + B v,
+    /// like the compiled step of LuGre at rest. `sigma0` in N·m/rad, `damping` B in N·m·s/rad: with this small model
+    /// the loop of a program can be compared.
+    pub fn bristle(inertia: f64, sigma0: f64, damping: f64, period: f64, late: Late) -> Loop {
+        let step = Step {
+            states: 1,
+            signals: 1,
+            commands: 1,
+            a: vec![1.0],
+            b: vec![period],
+            c: vec![-sigma0],
+            d: vec![-(sigma0 * period + damping)],
+        };
+        Loop { period, step, shaft: Shaft::rigid(inertia), late: vec![late] }
+    }
+
     /// State matrix over one period. The state consists of states of the shaft, applied torques, waiting set-points of
     /// each command, the newest first, and states of the program.
     pub fn matrix(&self) -> DMatrix<f64> {
@@ -324,21 +340,6 @@ mod tests {
     use super::*;
     use rayon::prelude::*;
 
-    /// A LuGre bristle at rest, stepped over the coming period with the newest speed: z' = z + T v, F = σ0 z' + (σ1 +
-    /// σ2) v, like the compiled step.
-    fn contact(inertia: f64, sigma0: f64, damping: f64, period: f64, late: Late) -> Loop {
-        let step = Step {
-            states: 1,
-            signals: 1,
-            commands: 1,
-            a: vec![1.0],
-            b: vec![period],
-            c: vec![-sigma0],
-            d: vec![-(sigma0 * period + damping)],
-        };
-        Loop { period, step, shaft: Shaft::rigid(inertia), late: vec![late] }
-    }
-
     fn lag_of(hertz: f64) -> f64 {
         1.0 / (2.0 * std::f64::consts::PI * hertz)
     }
@@ -348,7 +349,7 @@ mod tests {
         let lag = lag_of(hertz);
         let sigma0 = 1e5;
         let damping = 2.0 * zeta * f64::sqrt(sigma0);
-        let contact = contact(1.0, sigma0, damping, period, Late { dead: 0.0, lag });
+        let contact = Loop::bristle(1.0, sigma0, damping, period, Late { dead: 0.0, lag });
         1e3 * (0.5 * period + lag + contact.limit(0).unwrap())
     }
 
@@ -431,7 +432,7 @@ mod tests {
     fn the_simulated_radius_agrees_with_the_eigenvalues() {
         for (dead, zeta) in [(0.2e-3, 0.5), (0.8e-3, 0.5), (1.6e-3, 0.5), (2.4e-3, 0.5), (0.3e-3, 0.1)] {
             let late = Late { dead, lag: lag_of(500.0) };
-            let plain = contact(1.0, 1e5, 2.0 * zeta * f64::sqrt(1e5), 1e-3, late);
+            let plain = Loop::bristle(1.0, 1e5, 2.0 * zeta * f64::sqrt(1e5), 1e-3, late);
             let (exact, run) = (plain.radius(), ahead(plain, 1.0).radius());
             assert!((run - exact).abs() < 2e-3, "{dead} {zeta}: {run} for {exact}");
         }
@@ -442,7 +443,7 @@ mod tests {
     #[test]
     fn prediction_stabilises_a_delayed_contact() {
         let late = Late { dead: 4.5e-3, lag: lag_of(500.0) };
-        let plain = contact(1.0, 1e5, f64::sqrt(1e5), 1e-3, late);
+        let plain = Loop::bristle(1.0, 1e5, f64::sqrt(1e5), 1e-3, late);
         assert!(plain.radius() > 1.0);
         let mut looking = ahead(plain, 1.0);
         looking.ahead = vec![true];
@@ -471,7 +472,7 @@ mod tests {
         let judged = grid.par_iter().map(|&(inertia, natural, zeta, lag, period): &(f64, f64, f64, f64, f64)| {
             let (sigma0, damping) = (inertia * natural * natural, 2.0 * zeta * inertia * natural);
             let late = |dead: f64| Late { dead, lag };
-            let predicted = contact(inertia, sigma0, damping, period, late(0.0)).limit(0).unwrap();
+            let predicted = Loop::bristle(inertia, sigma0, damping, period, late(0.0)).limit(0).unwrap();
             let total = 0.5 * period + lag + predicted;
             // None if lag and period alone are too long, or so long that 5 % less would require a negative dead time.
             let below = predicted - 0.05 * total;

@@ -3,9 +3,8 @@
 use crate::can::Frame;
 use crate::drive::{Bench, Fieldbus, Options, Step};
 use crate::testing::models::Model;
-use abi::rig::{
-    Bus, Cia402, Field, Format, Kind, Message, Mode, Node, Output, Overrun, Plant, Rig, Signal, What, Within,
-};
+use crate::testing::nodes;
+use abi::rig::{Field, Format, Kind, Message, Mode, Node, Plant, Rig, Signal, What, Within};
 use abi::unit::Unit;
 use abi::{Function, Instance, Slot};
 
@@ -13,30 +12,10 @@ pub const LOAD: usize = 0;
 pub const SERVO: usize = 1;
 pub const PANEL: usize = 2;
 
+const PERIOD_NS: u64 = 1_000_000;
+
 pub fn drive(name: &str, node: u8, mode: Mode) -> Node {
-    let config = Cia402 {
-        node,
-        rated_torque: 4.0,
-        mode,
-        count: std::f64::consts::TAU / 262_144.0,
-        speed_unit: 0.01 * std::f64::consts::PI / 30.0,
-        max_torque: Some(2.0),
-        max_speed: Some(200.0),
-        travel: None,
-        max_power: None,
-        at_sync: false,
-        profile: "cia402".to_string(),
-    };
-    Node {
-        name: name.to_string(),
-        bus: 0,
-        kind: Kind::Cia402(config),
-        moves: true,
-        delay: 0.8e-3,
-        lag: 0.6e-3,
-        timeout_ns: 3_000_000,
-        within: Within::default(),
-    }
+    nodes::limited(nodes::drive(name, node, mode, PERIOD_NS), 2.0)
 }
 
 fn panel() -> Node {
@@ -86,31 +65,14 @@ pub fn rig(mode: Mode) -> Rig {
         Mode::Speed => What::Speed,
         Mode::Position => What::Position,
     };
-    let output = |node, what| Output {
-        signal: Signal { node, what },
-        slot: Slot(0),
-        low: f64::NEG_INFINITY,
-        high: f64::INFINITY,
-        slew: f64::INFINITY,
-        safe: 0.0,
-    };
+    let output = |node, what| nodes::output(node, what, Slot(0), [f64::NEG_INFINITY, f64::INFINITY]);
     let [load, servo, position, speed] = slots(&shaft(0.012, 0.001));
     let signal = |node, what| Signal { node, what };
+    let all = vec![drive("load", 3, mode), drive("servo", 4, mode), panel()];
     Rig {
-        name: "rtfs".to_string(),
-        period_ns: 1_000_000,
         method: abi::plan::Method::Expo,
-        steps: 1,
-        buses: vec![Bus { name: "can0".to_string(), address: "sim:bench".to_string(), bit_rate: 1_000_000 }],
-        nodes: vec![drive("load", 3, mode), drive("servo", 4, mode), panel()],
-        inputs: Vec::new(),
         outputs: vec![output(LOAD, what), output(SERVO, what), output(PANEL, What::Field(1, 0))],
-        watchdog_ns: 5_000_000,
-        overrun: Overrun::Stop,
-        stops: Vec::new(),
-        record: Vec::new(),
         predict: Some(LOAD),
-        needs_look: false,
         plant: Plant {
             applied: vec![(signal(LOAD, What::Torque), load), (signal(SERVO, What::Torque), servo)],
             seen: vec![
@@ -121,6 +83,7 @@ pub fn rig(mode: Mode) -> Rig {
             ],
             inertia: Some(0.012),
         },
+        ..nodes::rig("rtfs", "sim:bench", PERIOD_NS, all)
     }
 }
 

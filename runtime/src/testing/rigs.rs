@@ -2,9 +2,10 @@
 
 use crate::hil::live::Judge;
 use crate::testing::models::Model;
+use crate::testing::nodes;
 use abi::live::{Check, Live, Param, Place};
-use abi::plan::{Method, Series};
-use abi::rig::{Bus, Cia402, Input, Kind, Mode, Node, Output, Overrun, Plant, Rig, Signal, What, Within};
+use abi::plan::Series;
+use abi::rig::{Input, Mode, Node, Plant, Rig, Signal, What};
 use abi::unit::Unit;
 use abi::{Function, Instance};
 
@@ -13,37 +14,7 @@ pub const PERIOD_NS: u64 = 1_000_000;
 
 /// A CiA 402 drive in torque mode.
 pub fn drive(name: &str, node: u8) -> Node {
-    Node {
-        name: name.into(),
-        bus: 0,
-        kind: Kind::Cia402(Cia402 {
-            node,
-            rated_torque: 4.0,
-            mode: Mode::Torque,
-            count: 2.0 * std::f64::consts::PI / 262_144.0,
-            speed_unit: 0.01 * std::f64::consts::PI / 30.0,
-            max_torque: Some(4.0),
-            max_speed: Some(200.0),
-            travel: None,
-            max_power: None,
-            at_sync: false,
-            profile: "cia402".into(),
-        }),
-        moves: true,
-        delay: 0.8e-3,
-        lag: 0.6e-3,
-        timeout_ns: 3 * PERIOD_NS,
-        within: Within::default(),
-    }
-}
-
-/// The same with a torque limit, N·m.
-fn bounded(name: &str, node: u8, most: f64) -> Node {
-    let mut made = drive(name, node);
-    if let Kind::Cia402(drive) = &mut made.kind {
-        drive.max_torque = Some(most);
-    }
-    made
+    nodes::drive(name, node, Mode::Torque, PERIOD_NS)
 }
 
 /// The rig and its control program: dx/dt = speed of the drive, torque = −k x, with k = 10 N·m/rad as parameter.
@@ -58,30 +29,11 @@ pub fn rig() -> (Rig, Instance) {
         .build();
     let layout = &model.description().layout;
     let signal = |what| Signal { node: 0, what };
-    let output = Output {
-        signal: signal(What::Torque),
-        slot: layout.outputs.slot(0),
-        low: -1.0,
-        high: 1.0,
-        slew: f64::INFINITY,
-        safe: 0.0,
-    };
     let rig = Rig {
-        name: "spring".into(),
-        period_ns: PERIOD_NS,
-        method: Method::Rk4,
-        steps: 1,
-        buses: vec![Bus { name: "can0".into(), address: "sim:bench".into(), bit_rate: 1_000_000 }],
-        nodes: vec![drive("load", 3)],
         inputs: vec![Input { signal: signal(What::Speed), slot: layout.inputs.slot(0), start: 0.0, needed: true }],
-        outputs: vec![output],
-        watchdog_ns: 5 * PERIOD_NS,
-        overrun: Overrun::Stop,
-        stops: Vec::new(),
-        record: Vec::new(),
-        predict: None,
-        needs_look: false,
+        outputs: vec![nodes::output(0, What::Torque, layout.outputs.slot(0), [-1.0, 1.0])],
         plant: Plant { applied: Vec::new(), seen: Vec::new(), inertia: Some(0.012) },
+        ..nodes::rig("spring", "sim:bench", PERIOD_NS, vec![drive("load", 3)])
     };
     (rig, model)
 }
@@ -203,21 +155,14 @@ pub fn pair() -> (Rig, Instance, Instance) {
         .build();
     let (inside, outside) = (control.description().layout.clone(), plant.description().layout.clone());
     let signal = |node, what| Signal { node, what };
-    let output = |node, i, most: f64| Output {
-        signal: signal(node, What::Torque),
-        slot: inside.outputs.slot(i),
-        low: -most,
-        high: most,
-        slew: f64::INFINITY,
-        safe: 0.0,
-    };
+    let output = |node, i, most: f64| nodes::output(node, What::Torque, inside.outputs.slot(i), [-most, most]);
     let input =
         |node, what, i| Input { signal: signal(node, what), slot: inside.inputs.slot(i), start: 0.0, needed: true };
     let rig = Rig {
         name: "pair".into(),
         // The drives limit torque themselves, too (object 6072): a wrong value that passes the checksum stays within
         // the limit.
-        nodes: vec![bounded("load", 3, 1.0), bounded("servo", 4, 2.0)],
+        nodes: vec![nodes::limited(drive("load", 3), 1.0), nodes::limited(drive("servo", 4), 2.0)],
         inputs: vec![input(0, What::Speed, 0), input(1, What::Position, 1)],
         outputs: vec![output(1, 0, 2.0), output(0, 1, 1.0)],
         record: vec![Series {
