@@ -63,51 +63,51 @@ pub enum Command {
     Linearise(Linearise),
     /// Time the step of an experiment: alone, in lanes, on all cores
     Bench(Bench),
-    /// Make C or machine code of a model, to take away
+    /// Export a model as C or machine code, or a rig as a package
     Build(Build),
     /// Run a rig against the drives on its buses, or with --sim against simulated ones
     Hil(Hil),
-    /// Say before anything moves whether a rig is stable and how true it is
+    /// Predict whether a rig is stable, and its accuracy, before anything moves
     Predict(Predict),
-    /// Compute a rig's log again and compare every output to the bit
+    /// Recompute a rig's log and compare every output, to the bit
     Replay(Replay),
-    /// Find mistakes without running anything
+    /// Report errors and warnings without running anything
     Check(Check),
     /// Rewrite files in the one canonical layout
     Fmt(Fmt),
-    /// Say what an error or warning means, with an example
+    /// Explain an error code with an example, or a model
     Explain(Explain),
-    /// Put a friction model through the standard battery and write a report
+    /// Characterise a friction model by the standard battery and write a report
     Characterise(Characterise),
-    /// Put several friction models through the battery, on shared axes
+    /// Compare several friction models by the battery, on shared axes
     Compare(Compare),
-    /// Write the page of all models of the library, from its own text
+    /// Write the reference page of the library's models from its text
     Doc(Doc),
     /// Simulate the drives and devices of a rig on a bus that other programs can reach
     Drives(Drives),
-    /// Explore at a prompt; also what `fric` alone does
+    /// Interactive prompt; also what `fric` alone starts
     Repl(Repl),
-    /// Run an experiment again on each save, states carried over
+    /// Rerun an experiment at each save, with its states carried over
     Watch(Watch),
     /// Show everything in a package, and verify it
     Inspect(Inspect),
-    /// Make keys to sign packages with
+    /// Create keys to sign packages with
     Key {
         /// What to do
         #[command(subcommand)]
         command: Key,
     },
-    /// Put a rig onto the computer that runs it: build, copy, check there, swap at once
+    /// Install a rig on the computer that runs it: build, copy, check there, swap atomically
     Deploy(Deploy),
-    /// Bring recordings back from the computer that runs a rig
+    /// Copy recordings from the computer that runs a rig
     FetchLog(FetchLog),
-    /// Join CAN buses, open doors to them, and print their traffic
+    /// Bridge CAN buses, open ports to them, and print their traffic
     Bus(Bus),
-    /// Say what this machine lacks for real time, with the line that mends each
+    /// Check this machine for real time, with the command that fixes each problem
     Doctor(Doctor),
-    /// Run a loop as a rig does and say how late it wakes
+    /// Measure the wake-up latency of a loop like that of a rig
     BenchRt(BenchRt),
-    /// Make a folder with a first model and its experiment
+    /// Create a folder with a first model and its experiment
     New(New),
     /// Print completions for a shell
     Completions {
@@ -149,7 +149,7 @@ impl Set {
 /// Changes, and how steps are made.
 #[derive(clap::Args, Debug)]
 pub struct Stepped {
-    /// What of the text is changed
+    /// Changes to the text
     #[command(flatten)]
     pub set: Set,
     /// Solver in place of the experiment's own
@@ -170,7 +170,7 @@ impl Stepped {
 /// All that can be changed of an experiment.
 #[derive(clap::Args, Debug)]
 pub struct Changed {
-    /// What of the text is changed, and how steps are made
+    /// Changes to the text, and the solver
     #[command(flatten)]
     pub stepped: Stepped,
     /// Relative tolerance of an adaptive run, such as 1e-8
@@ -199,10 +199,10 @@ pub struct Trust {
     pub digits: Option<u8>,
 }
 
-/// Where the time goes.
+/// Timings.
 #[derive(clap::Args, Clone, Copy, Debug)]
 pub struct Timed {
-    /// Print how long each stage took, to the standard error
+    /// Print the time of each stage to the standard error
     #[arg(long)]
     pub timings: bool,
 }
@@ -215,7 +215,7 @@ pub struct Run {
     pub file: PathBuf,
     /// Experiments in it; all if none is named
     pub experiments: Vec<String>,
-    /// What of the experiment is changed
+    /// Changes to the experiment
     #[command(flatten)]
     pub changed: Changed,
     /// Folder for a plot (SVG) and the data (CSV) of each experiment [default: out, unless --plot, --csv or --json]
@@ -227,13 +227,13 @@ pub struct Run {
     /// Write the data of one experiment to this file
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
     pub csv: Option<PathBuf>,
-    /// Rows of the CSV this far apart, such as 1ms, instead of one for each step
+    /// Interval between rows of the CSV, such as 1ms, instead of one row per step
     #[arg(long, value_name = "TIME", value_parser = positive_time)]
     pub every: Option<f64>,
-    /// Print one JSON object a line for each run instead of words and plots
+    /// Print one JSON object per run, one a line, instead of text and plots
     #[arg(long)]
     pub json: bool,
-    /// Repeat it with another solver and say how far apart the two are
+    /// Repeat it with another solver and print the difference of the two
     #[arg(long)]
     pub cross: bool,
     /// Numerical errors
@@ -242,10 +242,10 @@ pub struct Run {
     /// Print failures only
     #[arg(long, short, conflicts_with = "json")]
     pub quiet: bool,
-    /// Interpret instead of making machine code: slow, for comparison
+    /// Interpret instead of compiling to machine code: same bits, slower
     #[arg(long)]
     pub interpret: bool,
-    /// Where the time goes
+    /// Timings
     #[command(flatten)]
     pub timed: Timed,
 }
@@ -256,7 +256,7 @@ pub struct Test {
     /// Texts, or folders to look through for them
     #[arg(required = true, value_name = "FILE|DIR", value_hint = ValueHint::AnyPath)]
     pub paths: Vec<PathBuf>,
-    /// Repeat each with another solver: what is expected must hold there too
+    /// Repeat each with another solver: its expectations must hold there too
     #[arg(long)]
     pub cross: bool,
     /// Numerical errors
@@ -265,10 +265,10 @@ pub struct Test {
     /// Print failures and the last line only
     #[arg(long, short)]
     pub quiet: bool,
-    /// Interpret instead of making machine code: slow, for comparison
+    /// Interpret instead of compiling to machine code: same bits, slower
     #[arg(long)]
     pub interpret: bool,
-    /// Where the time goes
+    /// Timings
     #[command(flatten)]
     pub timed: Timed,
 }
@@ -287,31 +287,31 @@ pub struct Sweep {
     /// Draws of the distributions, at each point of the grids [default: 100]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..=1_000_000_000))]
     pub runs: Option<u64>,
-    /// From which all that is random follows
+    /// Seed of all random numbers
     #[arg(long, value_name = "NUMBER", default_value_t = 1)]
     pub seed: u64,
     /// The table to write: .csv or .parquet
     #[arg(long, value_name = "FILE", default_value = "sweep.csv", value_hint = ValueHint::FilePath, value_parser = table)]
     pub out: PathBuf,
-    /// Go on with a table that was not finished
+    /// Continue an unfinished table
     #[arg(long)]
     pub resume: bool,
-    /// Do one of N parts; the tables of all parts one behind the other are that of the whole
+    /// Compute one of N parts; the tables of all parts in order are that of the whole
     #[arg(long, value_name = "I/N", value_parser = shard)]
     pub shard: Option<(u64, u64)>,
     /// Threads [default: one for each core]
     #[arg(long, value_name = "N", value_parser = threads)]
     pub threads: Option<usize>,
-    /// Draw measures over a parameter: .svg or .png
+    /// Plot measures over a parameter: .svg or .png
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath, value_parser = picture)]
     pub plot: Option<PathBuf>,
-    /// Which measure to draw, as written: 'period(x)' [default: all]
+    /// Measure to plot, as written: 'period(x)' [default: all]
     #[arg(long, value_name = "MEASURE", requires = "plot")]
     pub show: Option<String>,
-    /// Over which parameter to draw [default: the first]
+    /// Parameter of the horizontal axis [default: the first]
     #[arg(long, value_name = "PATH", requires = "plot")]
     pub against: Option<String>,
-    /// What of the experiment is changed
+    /// Changes to the experiment
     #[command(flatten)]
     pub changed: Changed,
     /// Leave out the companion runs that estimate the numerical errors of ten of the runs
@@ -320,7 +320,7 @@ pub struct Sweep {
     /// Print nothing but errors
     #[arg(long, short)]
     pub quiet: bool,
-    /// Interpret instead of making machine code: slow, for comparison
+    /// Interpret instead of compiling to machine code: same bits, slower
     #[arg(long)]
     pub interpret: bool,
 }
@@ -346,10 +346,10 @@ pub struct Linearise {
     /// Outputs, or other quantities [default: the outputs of the whole]
     #[arg(long, value_name = "PATH,…", value_delimiter = ',')]
     pub outputs: Vec<String>,
-    /// Parameters: P and Q then say how rates and outputs depend on them
+    /// Parameters: P and Q are the derivatives of rates and outputs with respect to them
     #[arg(long, value_name = "PATH,…", value_delimiter = ',')]
     pub params: Vec<String>,
-    /// What of the text is changed
+    /// Changes to the text
     #[command(flatten)]
     pub set: Set,
     /// Print a JSON object
@@ -368,7 +368,7 @@ pub struct Bench {
     pub file: PathBuf,
     /// The experiment in it to time
     pub experiment: String,
-    /// What of the experiment is changed
+    /// Changes to the experiment
     #[command(flatten)]
     pub stepped: Stepped,
     /// Print a JSON object
@@ -385,7 +385,7 @@ pub struct Build {
     /// A model, with its inputs free, an experiment, or a rig; the only one if none is named
     #[arg(value_name = "MODEL|EXPERIMENT|RIG")]
     pub name: Option<String>,
-    /// What to make of a model or an experiment; a rig becomes a package
+    /// Form of the output of a model or an experiment; a rig becomes a package
     #[arg(long, value_name = "WHAT", value_enum)]
     pub emit: Option<Emit>,
     /// File to write [default: the standard output]
@@ -397,11 +397,11 @@ pub struct Build {
     /// Processor: x86_64 or aarch64, also written x86_64-linux [default: this one]
     #[arg(long, value_name = "NAME", value_parser = target)]
     pub target: Option<Target>,
-    /// What the code may use besides what all code for x86_64 does: avx2, bmi1, bmi2, lzcnt, popcnt; it then runs where
-    /// they are only, with the same bits
+    /// Instruction set extensions that the code may use: avx2, bmi1, bmi2, lzcnt, popcnt; it then runs only on processors
+    /// that have them, with the same bits
     #[arg(long, value_name = "NAME,…", value_delimiter = ',', value_parser = feature)]
     pub features: Vec<Feature>,
-    /// What of it is changed, and how it is stepped
+    /// Changes to the text, and the solver
     #[command(flatten)]
     pub stepped: Stepped,
 }
@@ -421,16 +421,16 @@ pub struct Hil {
     /// Simulate buses, drives and devices in the process; arms itself
     #[arg(long)]
     pub sim: bool,
-    /// Simulated time: as fast as it computes, the same bits every time; needs --for, --check or --identify
+    /// Simulated time: as fast as possible, with the same bits every time; needs --for, --check or --identify
     #[arg(long)]
     pub fast: bool,
-    /// Put another bus under the rig: `can0=socketcan:can1`, `can0=slcan:/dev/ttyACM0@1000000`
+    /// Give a bus of the rig another address: `can0=socketcan:can1`, `can0=slcan:/dev/ttyACM0@1000000`
     #[arg(long, value_name = "BUS=ADDRESS", value_parser = setting)]
     pub bus: Vec<(String, String)>,
-    /// What of the text is changed
+    /// Changes to the text
     #[command(flatten)]
     pub set: Set,
-    /// Make simulated drives and devices fail: 'panel.enable = 0 at 5 s'
+    /// Inject faults into simulated drives and devices: 'panel.enable = 0 at 5 s'
     #[arg(long, value_name = "FAULT")]
     pub inject: Vec<String>,
     /// Do the checks of the start-up and stop before arming
@@ -439,40 +439,40 @@ pub struct Hil {
     /// Measure delay, lag and inertia by torque pulses instead of running the model; prints text to paste
     #[arg(long, conflicts_with = "check")]
     pub identify: bool,
-    /// Enable and arm without being told: simulated drives only
+    /// Enable and arm without an operator: simulated drives only
     #[arg(long)]
     pub arm: bool,
     /// Run although the loop is predicted to be unstable: simulated drives only
     #[arg(long)]
     pub accept_unstable: bool,
-    /// Stop when a contact gives back more energy than it can hold [default: count it]
+    /// Stop when a contact returns more energy than it can store [default: count it]
     #[arg(long)]
     pub stop_on_energy: bool,
-    /// Run although the host gives no real time: simulated drives only
+    /// Run although the host has no real-time scheduling: simulated drives only
     #[arg(long)]
     pub accept_jitter: bool,
-    /// Count missed ticks and go on: simulated drives only
+    /// Count missed ticks and continue: simulated drives only
     #[arg(long)]
     pub count_overruns: bool,
     /// The log [default: out/RIG.friclog]
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
     pub log: Option<PathBuf>,
-    /// Go on in a further file, RIG.2.friclog, after so many bytes of log
+    /// Begin a new file, RIG.2.friclog, after this many bytes of log
     #[arg(long, value_name = "SIZE", value_parser = runtime::record::parts::bytes, default_value = "256MB")]
     pub roll: u64,
-    /// Remove the oldest logs in the folder of the log, so that all together have so many bytes at most [default: keep all]
+    /// Remove the oldest logs in the folder of the log, so that all together have at most this many bytes [default: keep all]
     #[arg(long, value_name = "SIZE", value_parser = runtime::record::parts::bytes, conflicts_with = "no_log")]
     pub keep: Option<u64>,
-    /// Keep only the last ten seconds, written if the rig is stopped by safety
+    /// Keep only the last ten seconds, written if the safety supervisor stops the rig
     #[arg(long, conflicts_with = "log")]
     pub no_log: bool,
-    /// From which all that is random in a simulation follows
+    /// Seed of all random numbers of a simulation
     #[arg(long, value_name = "NUMBER", default_value_t = 1)]
     pub seed: u64,
     /// Print failures only
     #[arg(long, short)]
     pub quiet: bool,
-    /// Interpret instead of making machine code: slow, for comparison
+    /// Interpret instead of compiling to machine code: same bits, slower
     #[arg(long)]
     pub interpret: bool,
 }
@@ -491,7 +491,7 @@ pub struct Predict {
     /// The rig [default: that of the experiment, or the only one]
     #[arg(long, value_name = "RIG")]
     pub rig: Option<String>,
-    /// What of the text is changed
+    /// Changes to the text
     #[command(flatten)]
     pub set: Set,
     /// One JSON object
@@ -514,7 +514,7 @@ pub struct Replay {
     /// Write its frames as candump -L does; `replay:FILE` is a bus that reads it
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
     pub candump: Option<PathBuf>,
-    /// Interpret instead of making machine code: the bits are the same
+    /// Interpret instead of compiling to machine code: same bits, slower
     #[arg(long)]
     pub interpret: bool,
 }
@@ -531,7 +531,7 @@ pub struct Check {
     /// Print one line each: `file:line:column: E0101 message`
     #[arg(long, conflicts_with = "json")]
     pub short: bool,
-    /// Where the time goes
+    /// Timings
     #[command(flatten)]
     pub timed: Timed,
 }
@@ -581,7 +581,7 @@ pub struct Characterise {
     /// Folder for the report, the battery and the tables [default: out/MODEL]
     #[arg(long, value_name = "DIR", value_hint = ValueHint::DirPath)]
     pub out: Option<PathBuf>,
-    /// Print one JSON object a line for each model instead of words
+    /// Print one JSON object per model, one a line, instead of text
     #[arg(long)]
     pub json: bool,
 }
@@ -595,7 +595,7 @@ pub struct Compare {
     /// Folder for the page [default: out/compare]
     #[arg(long, value_name = "DIR", value_hint = ValueHint::DirPath)]
     pub out: Option<PathBuf>,
-    /// Print one JSON object a line for each model instead of words
+    /// Print one JSON object per model, one a line, instead of text
     #[arg(long)]
     pub json: bool,
 }
@@ -622,31 +622,31 @@ pub struct Drives {
     pub file: PathBuf,
     /// The rig in it; the only one if none is named
     pub rig: Option<String>,
-    /// Serve them on another bus: `can0=socketcan:can1`, `can0=slcan:/dev/ttyACM0@1000000`
+    /// Serve them at another address: `can0=socketcan:can1`, `can0=slcan:/dev/ttyACM0@1000000`
     #[arg(long, value_name = "BUS=ADDRESS", value_parser = setting)]
     pub bus: Vec<(String, String)>,
-    /// Open a pseudo-terminal that speaks like an slcan adapter, with a link to it here
+    /// Open a pseudo-terminal with the slcan protocol, and a link to it at this path
     #[arg(long, value_name = "PATH", value_hint = ValueHint::FilePath)]
     pub pty: Vec<PathBuf>,
-    /// Open a TCP port that speaks like socketcand, 0 for a free one
+    /// Open a TCP port with the socketcand protocol, 0 for a free one
     #[arg(long, value_name = "PORT")]
     pub tcp: Option<u16>,
-    /// Make them fail: 'load fault 0x2310 at 3 s', 'panel.enable = 0 at 5 s'
+    /// Inject faults: 'load fault 0x2310 at 3 s', 'panel.enable = 0 at 5 s'
     #[arg(long, value_name = "FAULT")]
     pub inject: Vec<String>,
-    /// Give a drive the further objects of a data sheet (EDS, DCF): `load=servo.eds`
+    /// Add the objects of a data sheet (EDS, DCF) to a drive: `load=servo.eds`
     #[arg(long, value_name = "DRIVE=FILE", value_parser = sheet)]
     pub eds: Vec<(String, String)>,
-    /// What of the text is changed
+    /// Changes to the text
     #[command(flatten)]
     pub set: Set,
-    /// From which all that is random follows
+    /// Seed of all random numbers
     #[arg(long, value_name = "NUMBER", default_value_t = 1)]
     pub seed: u64,
     /// End after this time, such as 10s [default: Ctrl-C]
     #[arg(long = "for", value_name = "TIME", value_parser = positive_time)]
     pub duration: Option<f64>,
-    /// Don't tell how their states change
+    /// Do not print changes of their states
     #[arg(long, short)]
     pub quiet: bool,
 }
@@ -657,10 +657,10 @@ pub struct Repl {
     /// A text to use from the beginning
     #[arg(value_hint = ValueHint::FilePath)]
     pub file: Option<PathBuf>,
-    /// Go on after an error where lines are piped in; the exit code is 1 all the same
+    /// Continue after an error in lines from a pipe; the exit code is still 1
     #[arg(long)]
     pub keep_going: bool,
-    /// Print each line that is piped in before what it gives, as a terminal shows it
+    /// Print each line from a pipe before its result, as a terminal shows it
     #[arg(long)]
     pub echo: bool,
 }
@@ -672,25 +672,25 @@ pub struct Bus {
     /// Buses to join, such as can0, sim:bench, slcan:/dev/ttyACM0@1000000, socketcand:host/can0
     #[arg(value_name = "ADDRESS", required_unless_present_any = ["pty", "tcp"], value_parser = address)]
     pub addresses: Vec<Address>,
-    /// Open a pseudo-terminal that speaks like an slcan adapter, with a link to it here
+    /// Open a pseudo-terminal with the slcan protocol, and a link to it at this path
     #[arg(long, value_name = "PATH", value_hint = ValueHint::FilePath)]
     pub pty: Vec<PathBuf>,
-    /// Open a TCP port that speaks like socketcand, 0 for a free one
+    /// Open a TCP port with the socketcand protocol, 0 for a free one
     #[arg(long, value_name = "PORT")]
     pub tcp: Option<u16>,
-    /// Let other machines come to the TCP port too
+    /// Accept connections to the TCP port from other machines
     #[arg(long, requires = "tcp")]
     pub everywhere: bool,
-    /// Bits a second of buses whose address does not say: simulated ones get it, interfaces are compared with it
+    /// Bit rate of buses whose address has none: simulated ones get it, interfaces are compared with it
     #[arg(long, value_name = "BITS", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
     pub bit_rate: Option<u32>,
-    /// Name frames and what they carry by this text with rigs, DBC file, or data sheet (EDS, DCF); any number of them
+    /// Name frames and signals by this text with rigs, DBC file, or data sheet (EDS, DCF); repeatable
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
     pub names: Vec<PathBuf>,
     /// Print traffic as `candump -L` does, for `replay:`
     #[arg(long)]
     pub log: bool,
-    /// Join without printing traffic
+    /// Bridge without printing traffic
     #[arg(long, short, conflicts_with = "log")]
     pub quiet: bool,
     /// End after this time, such as 10s [default: Ctrl-C]
@@ -708,10 +708,10 @@ const BUS_ADDRESSES: &str = "Addresses:\n  \
 /// `fric doctor`
 #[derive(clap::Args, Debug)]
 pub struct Doctor {
-    /// Rigs whose buses to look at too, and buses such as can0
+    /// Rigs whose buses to check too, and buses such as can0
     #[arg(value_name = "RIG.fric|ADDRESS", value_hint = ValueHint::FilePath, value_parser = looked_at)]
     pub targets: Vec<LookedAt>,
-    /// Bits a second that the buses named here should have
+    /// Expected bit rate of the buses named here
     #[arg(long, value_name = "BITS", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
     pub bit_rate: Option<u32>,
     /// Priority of the loop that will run
@@ -743,7 +743,7 @@ pub struct BenchRt {
     /// How long to run
     #[arg(long, value_name = "N", default_value_t = 10, value_parser = clap::value_parser!(u64).range(1..=86_400))]
     pub seconds: u64,
-    /// Stay on this core [default: an isolated one, if there is any]
+    /// Core to run on [default: an isolated one, if there is any]
     #[arg(long, value_name = "N")]
     pub core: Option<usize>,
     /// Priority under SCHED_FIFO
@@ -773,10 +773,10 @@ pub struct Inspect {
     /// Folder with public keys: the package must be signed by one of them
     #[arg(long, value_name = "DIR", value_hint = ValueHint::DirPath)]
     pub trusted: Option<PathBuf>,
-    /// Print the texts it was made from
+    /// Print its source texts
     #[arg(long)]
     pub sources: bool,
-    /// Write all its sections into a folder
+    /// Extract all its sections into a folder
     #[arg(long, value_name = "DIR", value_hint = ValueHint::DirPath)]
     pub extract: Option<PathBuf>,
 }
@@ -784,7 +784,7 @@ pub struct Inspect {
 /// `fric key`
 #[derive(Subcommand, Debug)]
 pub enum Key {
-    /// Make a pair: NAME.key to sign with, NAME.pub to be trusted
+    /// Create a pair: NAME.key to sign with, NAME.pub to be trusted
     New(KeyNew),
 }
 
@@ -825,33 +825,33 @@ pub struct Deploy {
     /// The rig in the text; not needed if it is the only one
     #[arg(value_name = "RIG")]
     pub name: Option<String>,
-    /// What of the text is changed
+    /// Changes to the text
     #[command(flatten)]
     pub set: Set,
     /// Sign the package with this secret key [default: a key of yours, made on first use; a rig that trusts no key yet gets its
     /// public one]
     #[arg(long, value_name = "FILE.key", value_hint = ValueHint::FilePath)]
     pub sign: Option<PathBuf>,
-    /// Don't sign it, and let it run on real buses there all the same; not where keys are trusted
+    /// Do not sign it, and permit it on real buses there; not where keys are trusted
     #[arg(long, conflicts_with = "sign")]
     pub allow_unsigned: bool,
-    /// Install it though it was signed before the one that is installed there
+    /// Install it even if it was signed before the one that is installed there
     #[arg(long)]
     pub allow_older: bool,
-    /// Folder with the trusted keys there, where it is another than /etc/fric/trusted
+    /// Folder with the trusted keys there [default: /etc/fric/trusted]
     #[arg(long, value_name = "DIR")]
     pub trusted: Option<String>,
-    /// Start it there, and go back to the package before if it refuses; on a terminal, then tell its state until Ctrl-C,
+    /// Start it there, and return to the previous package if it refuses; on a terminal, then print its state until Ctrl-C,
     /// which does not end the rig
     #[arg(long)]
     pub start: bool,
-    /// Tell its state until Ctrl-C also where the output is no terminal
+    /// Print its state until Ctrl-C even if the output is no terminal
     #[arg(long, requires = "start")]
     pub follow: bool,
-    /// As it is started: go on in a further file after so many bytes of log [default: 256MB]
+    /// For its start: begin a new file after this many bytes of log [default: 256MB]
     #[arg(long, requires = "start", value_name = "SIZE", value_parser = runtime::record::parts::bytes)]
     pub roll: Option<u64>,
-    /// As it is started: remove its oldest logs, so that all together have so many bytes at most [default: keep all]
+    /// For its start: remove its oldest logs, so that all together have at most this many bytes [default: keep all]
     #[arg(long, requires = "start", value_name = "SIZE", value_parser = runtime::record::parts::bytes)]
     pub keep: Option<u64>,
 }
@@ -875,7 +875,7 @@ pub struct FetchLog {
 /// `fric new`
 #[derive(clap::Args, Debug)]
 pub struct New {
-    /// Folder to make; it must not hold anything yet
+    /// Folder to create; it must be empty
     #[arg(value_hint = ValueHint::DirPath)]
     pub dir: PathBuf,
 }

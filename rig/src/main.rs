@@ -38,23 +38,23 @@ const EXIT_CODES: &str =
 
 #[derive(Subcommand, Debug)]
 enum Command {
-    /// Verify a package: whole, for this computer, of this version, signed if keys are trusted
+    /// Verify a package: its hashes, its target, its version, and its signature if keys are trusted
     Check(Check),
     /// Run the current package, or the one named; nothing moves before `say enable`, `say arm`
     Run(Run),
-    /// Run the current package in the background; fails if it does not get through its first second
+    /// Run the current package in the background; fails if it ends within its first second
     Start(Start),
     /// Simulate the drives and devices of a package on a bus that other programs can reach
     Drives(Drives),
-    /// Tell the rig that runs: enable, arm, set PATH = VALUE or stop
+    /// Command the running rig: enable, arm, set PATH = VALUE or stop
     Say(Say),
-    /// Say whether this computer can keep time, and what to change
+    /// Check this computer for real time, and print what to change
     Doctor,
-    /// Make a package the one that runs next; the one before is kept for `rollback`
+    /// Make a package the current one; the previous one is kept for `rollback`
     Install(Install),
-    /// Make the package before the current one the current one again
+    /// Make the previous package the current one again
     Rollback(Store),
-    /// Say what is installed, and what runs
+    /// Print what is installed, and what runs
     Status(Status),
     /// Show the keys that are trusted, or register one: packages must then be signed
     Trust(Register),
@@ -82,7 +82,7 @@ struct Keys {
 struct Trust {
     #[command(flatten)]
     keys: Keys,
-    /// Run it on real buses though no trusted key has signed it; where keys are trusted, one of them must have
+    /// Run it on real buses without a trusted signature; where keys are trusted, one of them must have signed it
     #[arg(long)]
     allow_unsigned: bool,
 }
@@ -109,7 +109,7 @@ struct Run {
     /// Simulated buses, drives and devices; arms itself
     #[arg(long)]
     sim: bool,
-    /// Simulated time: as fast as it computes, the same bits every time; needs --for or --check
+    /// Simulated time: as fast as possible, with the same bits every time; needs --for or --check
     #[arg(long, requires = "sim")]
     fast: bool,
     /// Do the checks of the start-up and stop before arming
@@ -118,7 +118,7 @@ struct Run {
     /// Time the model runs, such as 60s [default: until it is stopped]
     #[arg(long = "for", value_name = "TIME", value_parser = seconds)]
     duration: Option<f64>,
-    /// Put another bus under the rig: can0=socketcan:can1
+    /// Give a bus of the rig another address: can0=socketcan:can1
     #[arg(long, value_name = "BUS=ADDRESS", value_parser = address)]
     bus: Vec<(String, String)>,
     /// The log [default: DIR/log/RIG-TIME.friclog]
@@ -134,10 +134,10 @@ struct Run {
 
 #[derive(clap::Args, Debug)]
 struct Sizes {
-    /// Go on in a further file, RIG-TIME.2.friclog, after so many bytes of log
+    /// Begin a new file, RIG-TIME.2.friclog, after this many bytes of log
     #[arg(long, value_name = "SIZE", value_parser = parts::bytes, default_value = "256MB")]
     roll: u64,
-    /// Remove the oldest logs in the folder of the log, so that all together have so many bytes at most [default: keep all]
+    /// Remove the oldest logs in the folder of the log, so that all together have at most this many bytes [default: keep all]
     #[arg(long, value_name = "SIZE", value_parser = parts::bytes)]
     keep: Option<u64>,
 }
@@ -153,25 +153,25 @@ struct Drives {
     /// The package
     #[arg(value_name = "FILE.fricpkg", value_hint = ValueHint::FilePath)]
     package: PathBuf,
-    /// Serve them on another bus: can0=socketcan:can1
+    /// Serve them at another address: can0=socketcan:can1
     #[arg(long, value_name = "BUS=ADDRESS", value_parser = address)]
     bus: Vec<(String, String)>,
-    /// Open a pseudo-terminal that speaks like an slcan adapter, with a link to it here
+    /// Open a pseudo-terminal with the slcan protocol, and a link to it at this path
     #[arg(long, value_name = "PATH", value_hint = ValueHint::FilePath)]
     pty: Vec<PathBuf>,
-    /// Open a TCP port that speaks like socketcand, 0 for a free one
+    /// Open a TCP port with the socketcand protocol, 0 for a free one
     #[arg(long, value_name = "PORT")]
     tcp: Option<u16>,
-    /// Make them fail: 'load fault 0x2310 at 3 s', 'panel.enable = 0 at 5 s'
+    /// Inject faults: 'load fault 0x2310 at 3 s', 'panel.enable = 0 at 5 s'
     #[arg(long, value_name = "FAULT")]
     inject: Vec<String>,
-    /// From which all that is random follows
+    /// Seed of all random numbers
     #[arg(long, value_name = "NUMBER", default_value_t = 1)]
     seed: u64,
     /// End after this time, such as 10s [default: Ctrl-C]
     #[arg(long = "for", value_name = "TIME", value_parser = seconds)]
     duration: Option<f64>,
-    /// Don't tell how their states change
+    /// Do not print changes of their states
     #[arg(long, short)]
     quiet: bool,
     #[command(flatten)]
@@ -180,7 +180,7 @@ struct Drives {
 
 #[derive(clap::Args, Debug)]
 struct Say {
-    /// enable, arm, stop; or a set of parameters, `set fr.Fs = 0.5 N·m, fr.Fc = 0.3 N·m`: it acts as one or not at all
+    /// enable, arm, stop; or a set of parameters, `set fr.Fs = 0.5 N·m, fr.Fc = 0.3 N·m`: it is applied as a whole or refused
     #[arg(value_name = "COMMAND", required = true, allow_negative_numbers = true)]
     what: Vec<String>,
     #[command(flatten)]
@@ -192,7 +192,7 @@ struct Install {
     /// The package
     #[arg(value_name = "FILE.fricpkg", value_hint = ValueHint::FilePath)]
     package: PathBuf,
-    /// Install it though it was signed before the one that is installed
+    /// Install it even if it was signed before the one that is installed
     #[arg(long)]
     allow_older: bool,
     #[command(flatten)]
