@@ -11,7 +11,7 @@ use crate::coupling::predictor::Wired;
 use crate::drive::profiles;
 use crate::safety::{Cause, DriveCommand, Protection, Seen, Supervisor, Timeouts, is_present};
 use abi::rig::{Kind, Overrun, Rig, Signal, What};
-use abi::{Function, Instance, Slot};
+use abi::{Instance, Slot};
 
 /// A value with its age.
 #[derive(Clone, Copy, PartialEq, Debug)]
