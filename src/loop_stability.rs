@@ -7,7 +7,7 @@ use crate::compile::{self, Ready, StepDerivative};
 use crate::quantity::significant;
 use abi::Slot;
 use abi::rig::{Kind, Mode, Signal, What};
-use runtime::coupling::loop_stability::{Ahead, Late, Loop, Shaft, Step};
+use runtime::coupling::loop_stability::{Ahead, CommandDelay, Loop, Shaft, Step};
 use runtime::coupling::predictor::Wired;
 
 /// The emulated contact of one drive.
@@ -15,7 +15,7 @@ pub struct Contact {
     /// The name of the drive.
     pub drive: String,
     /// The delay and lag of its commands.
-    pub late: Late,
+    pub late: CommandDelay,
     inputs: Vec<Slot>,
     /// For each input whether it is measured by this drive.
     own: Vec<bool>,
@@ -68,8 +68,10 @@ pub fn contacts(ready: &Ready) -> Vec<Contact> {
         let outputs: Vec<Slot> = signals.iter().map(|(_, seen, _)| *seen).chain(position).collect();
         let Some((shaft, states)) = compile::linear_of(&ready.plant_program, &[*torque], &outputs) else { continue };
         let derivative = StepDerivative::new(&ready.program, rig.method, &inputs, &[output.slot]);
-        let late =
-            Late { dead: node.delay + if drive.at_sync { rig.period_ns as f64 * 1e-9 } else { 0.0 }, lag: node.lag };
+        let late = CommandDelay {
+            dead: node.delay + if drive.at_sync { rig.period_ns as f64 * 1e-9 } else { 0.0 },
+            lag: node.lag,
+        };
         let mut rows = shaft.c;
         let position = position.map(|_| rows.split_off(inputs.len() * states));
         let shaft = Shaft { states, torques: 1, signals: inputs.len(), a: shaft.a, b: shaft.b, c: rows };

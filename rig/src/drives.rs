@@ -29,6 +29,6 @@ pub fn drives(open: &Open, doors: &Doors, duration: Option<f64>, quiet: bool) ->
             words::print(&format!("{line}\n"));
         }
     };
-    served.serve(rig, duration, &|| emergency::asked().is_some(), &mut told);
+    served.serve(rig, duration, &|| emergency::requested_stop().is_some(), &mut told);
     Ok(0)
 }

@@ -290,7 +290,7 @@ fn served(args: &Drives) -> Result<u8, String> {
 
 /// Runs a package.
 fn ran(args: &Run) -> Result<u8, String> {
-    let wanted = run::Wanted {
+    let wanted = run::RunArguments {
         package: args.package.as_deref(),
         trusted: &args.trust.keys.trusted,
         allow_unsigned: args.trust.allow_unsigned,

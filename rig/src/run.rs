@@ -11,7 +11,7 @@ use runtime::can::Bus;
 use runtime::can::sim::Simulation;
 use runtime::hil::cycle::{Command, End, Gauges};
 use runtime::hil::live::Judge;
-use runtime::hil::operator::{Answer, NO_RESET, Operator, Stamp, Stopper, Why};
+use runtime::hil::operator::{Answer, NO_RESET, Operator, Reason, Stamp, Stopper};
 use runtime::hil::session::{self, Drives, Session, Setup};
 use runtime::hil::simulated::World;
 use runtime::hil::{emergency, watches};
@@ -30,7 +30,7 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 const LOOK: Duration = Duration::from_millis(100);
 
 /// Arguments of a run.
-pub struct Wanted<'a> {
+pub struct RunArguments<'a> {
     /// A package; none: the current one of the store.
     pub package: Option<&'a Path>,
     /// Folder of the trusted public keys.
@@ -68,7 +68,7 @@ pub enum Ended {
 }
 
 /// Runs until the end; returns the exit code.
-pub fn run(wanted: &Wanted) -> Result<u8, String> {
+pub fn run(wanted: &RunArguments) -> Result<u8, String> {
     let store = Store::at(wanted.dir);
     if wanted.package.is_none() && store.current_target().is_none() {
         let current = wanted.dir.join("current");
@@ -110,7 +110,7 @@ pub fn run(wanted: &Wanted) -> Result<u8, String> {
     }
 }
 
-fn once(wanted: &Wanted, open: &Open, store: &Store, target: &Path) -> Result<Ended, String> {
+fn once(wanted: &RunArguments, open: &Open, store: &Store, target: &Path) -> Result<Ended, String> {
     if wanted.fast && wanted.duration.is_none() && !wanted.check {
         return Err(session::FAST_WITHOUT_END.into());
     }
@@ -161,7 +161,7 @@ fn once(wanted: &Wanted, open: &Open, store: &Store, target: &Path) -> Result<En
         1e9 / rig.period_ns as f64,
         if drives.are_simulated() { "simulated drives" } else { "drives on their buses" }
     ));
-    for lack in watches::lacking(&rig) {
+    for lack in watches::missing_monitors(&rig) {
         words::print(&format!("  note: {lack}\n"));
     }
     let operator = session.operator().filter(|_| !drives.is_fast());
@@ -181,7 +181,7 @@ fn once(wanted: &Wanted, open: &Open, store: &Store, target: &Path) -> Result<En
     // An operator who stops a rig while another package waits wants that package to run next, unless the process itself
     // is to end.
     let waits = wanted.package.is_none() && store.current_target().is_some_and(|current| current != target);
-    let goes_on = waits && wanted.duration.is_none() && !wanted.check && emergency::asked().is_none();
+    let goes_on = waits && wanted.duration.is_none() && !wanted.check && emergency::requested_stop().is_none();
     match end {
         End::Asked if replaced || goes_on => Ok(Ended::Replaced),
         End::Asked => Ok(Ended::Asked),
@@ -192,7 +192,7 @@ fn once(wanted: &Wanted, open: &Open, store: &Store, target: &Path) -> Result<En
 }
 
 /// File and head of the recording; the head contains everything that a replay needs.
-fn log(wanted: &Wanted, open: &Open, rig: &Rig, drives: Drives) -> Result<(Settings, Sections), String> {
+fn log(wanted: &RunArguments, open: &Open, rig: &Rig, drives: Drives) -> Result<(Settings, Sections), String> {
     let head = open.head();
     let head = head.with("started", session::started(drives)).with("package", runtime::package::hash(&open.bytes));
     let path = match wanted.log {
@@ -215,7 +215,7 @@ struct Attendant {
 
 impl Attendant {
     fn new(
-        wanted: &Wanted,
+        wanted: &RunArguments,
         store: &Store,
         target: &Path,
         gauges: Arc<Gauges>,
@@ -343,8 +343,8 @@ impl Desk {
             },
         };
         let operator = || self.operator.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
-        let refused = |why: Why| match why {
-            Why::Set(objection) => format!("refused: {}", self.judge.words(&objection)),
+        let refused = |why: Reason| match why {
+            Reason::Set(objection) => format!("refused: {}", self.judge.words(&objection)),
             why => format!("refused: {}", why.words()),
         };
         let ticket = operator().say_at(command, stamp).map_err(refused)?;
@@ -429,9 +429,9 @@ const NOT_STARTED: &str = "the new package does not start: ";
 /// Signatures that a rig to be started trusts.
 #[derive(Clone, Copy)]
 pub struct Trust<'a> {
-    /// As [`Wanted::trusted`].
+    /// As [`RunArguments::trusted`].
     pub trusted: &'a Path,
-    /// As [`Wanted::allow_unsigned`].
+    /// As [`RunArguments::allow_unsigned`].
     pub allow_unsigned: bool,
 }
 

@@ -82,7 +82,7 @@ pub fn run(period_ns: u64, cycles: u64, wishes: &Wishes, stop: impl Fn() -> bool
         refused: Vec::new(),
     };
     let real_time = threads::enter(wishes);
-    let before = threads::suffered();
+    let before = threads::interruptions();
     let origin_ns = clock.now_ns() + period_ns;
     let mut k = 0;
     while report.cycles < cycles && !stop() {
@@ -116,7 +116,7 @@ pub fn run(period_ns: u64, cycles: u64, wishes: &Wishes, stop: impl Fn() -> bool
         report.overruns += u64::from(late > 0);
         k += 1 + late;
     }
-    report.page_faults = threads::suffered().page_faults - before.page_faults;
+    report.page_faults = threads::interruptions().page_faults - before.page_faults;
     report.refused = real_time.refused().to_vec();
     report
 }

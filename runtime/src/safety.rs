@@ -45,7 +45,7 @@ pub struct DriveLimits {
 
 /// Measured speed and position of one drive, where known; SI.
 #[derive(Clone, Copy, PartialEq, Debug, Default)]
-pub struct Seen {
+pub struct Measured {
     /// rad/s
     pub speed: Option<f64>,
     /// rad
@@ -512,7 +512,7 @@ impl Supervisor {
     /// drives.
     ///
     /// `requests`: one value per output. `seen`: measurements, one entry per drive.
-    pub fn judge(&mut self, requests: &[f64], seen: &[Seen]) -> DriveCommand {
+    pub fn judge(&mut self, requests: &[f64], seen: &[Measured]) -> DriveCommand {
         assert_eq!((requests.len(), seen.len()), (self.outputs.len(), self.drives.len()), "outputs and drives");
         if !self.on(Protection::Latch) && matches!(self.stage, Stage::Slewing(_) | Stage::Quick(_)) {
             self.stage = Stage::Armed(self.patience.ramp);
@@ -556,7 +556,7 @@ impl Supervisor {
     }
 
     /// Trips on measurements that are outside the limits of a drive.
-    fn watch(&mut self, seen: &[Seen]) {
+    fn watch(&mut self, seen: &[Measured]) {
         for (i, seen) in seen.iter().enumerate() {
             // Written so that NaN counts as outside.
             let DriveLimits { speed: most, travel: (low, high), .. } = self.drives[i];
@@ -577,7 +577,7 @@ impl Supervisor {
     /// Trips on a run-away: torque that takes power out of the shaft cannot accelerate it, unless a sign is wrong.
     ///
     /// The sum of torque times speed over all drives of the shaft does not depend on the sign convention of each drive.
-    fn watch_run_away(&mut self, seen: &[Seen]) {
+    fn watch_run_away(&mut self, seen: &[Measured]) {
         let power: f64 = (self.outputs.iter().zip(&self.permitted))
             .filter(|(output, _)| output.torque)
             .filter_map(|(output, torque)| Some(torque * seen[output.drive?].speed?))
@@ -594,7 +594,7 @@ impl Supervisor {
     }
 
     /// Limits the requests to range, ramp, slew and power.
-    fn follow(&mut self, requests: &[f64], seen: &[Seen], for_cycles: u32) {
+    fn follow(&mut self, requests: &[f64], seen: &[Measured], for_cycles: u32) {
         if let Some(i) = self.clamped.iter().position(|cycles| *cycles > self.patience.clamped)
             && self.on(Protection::Clamped)
         {
@@ -636,7 +636,7 @@ impl Supervisor {
     }
 
     /// Highest torque at the measured speed of the drive of this output, N·m; none where there is no such limit.
-    fn power_limit(&self, limits: OutputLimits, seen: &[Seen]) -> Option<f64> {
+    fn power_limit(&self, limits: OutputLimits, seen: &[Measured]) -> Option<f64> {
         let drive = limits.drive.filter(|_| limits.torque)?;
         Some(self.drives[drive].power / seen[drive].speed?.abs())
     }
@@ -762,8 +762,8 @@ mod tests {
         supervisor
     }
 
-    fn at(speed: f64) -> [Seen; 1] {
-        [Seen { speed: Some(speed), position: Some(0.0) }]
+    fn at(speed: f64) -> [Measured; 1] {
+        [Measured { speed: Some(speed), position: Some(0.0) }]
     }
 
     /// Passes one request at a speed; returns the permitted value.
@@ -805,7 +805,7 @@ mod tests {
         assert_eq!(sent(&mut slow, 0.15, 0.0), 0.15);
         assert_eq!(sent(&mut slow, -1.0, 0.0), 0.15 - 0.1);
         let mut unmeasured = armed(FREE, PATIENCE);
-        unmeasured.judge(&[2.0], &[Seen::default()]);
+        unmeasured.judge(&[2.0], &[Measured::default()]);
         assert_eq!(unmeasured.permitted(), [2.0], "no speed, no power");
     }
 
@@ -838,7 +838,7 @@ mod tests {
         assert_eq!(fast.judge(&[1.0], &at(-100.1)), DriveCommand::QuickStop);
         assert_eq!((fast.permitted(), fast.cause()), (&[0.0][..], Some(Cause::Speed(0, -100.1))));
         let mut far = armed(FREE, PATIENCE);
-        assert_eq!(far.judge(&[1.0], &[Seen { position: Some(10.1), speed: None }]), DriveCommand::QuickStop);
+        assert_eq!(far.judge(&[1.0], &[Measured { position: Some(10.1), speed: None }]), DriveCommand::QuickStop);
         assert_eq!(far.cause(), Some(Cause::Travel(0, 10.1)));
         let mut odd = armed(FREE, PATIENCE);
         assert_eq!(odd.judge(&[1.0], &at(f64::NAN)), DriveCommand::QuickStop);

@@ -378,7 +378,7 @@ fn begin(rig: &Rig, drives: Drives, refused: &[Refusal], notes: &[String], termi
     for note in notes {
         terminal.line(&format!("  note: {note}"));
     }
-    for lack in watches::lacking(rig) {
+    for lack in watches::missing_monitors(rig) {
         terminal.line(&format!("  note: {lack}"));
     }
     if !refused.is_empty() {

@@ -10,7 +10,7 @@ use crate::terminal::Terminal;
 use abi::Instance;
 use grammar::diagnostic::Diagnostic;
 use runtime::hil::live::{Judge, Set};
-use runtime::hil::operator::{Answer, Command, NO_RESET, Operator, Why};
+use runtime::hil::operator::{Answer, Command, NO_RESET, Operator, Reason};
 use runtime::record::log::Sections;
 use std::io::BufRead;
 use std::sync::mpsc::{Receiver, channel};
@@ -86,7 +86,7 @@ impl Rehearsal {
         self.judge(&set, &all)?;
         match operator.wait(Command::Set(set)) {
             Answer::Taken => {}
-            Answer::Refused(Why::Set(objection)) => return Err(self.judge.words(&objection)),
+            Answer::Refused(Reason::Set(objection)) => return Err(self.judge.words(&objection)),
             Answer::Refused(why) => return Err(why.words()),
         }
         set.values().iter().for_each(|(slot, value)| self.control.set(*slot, *value));
@@ -128,7 +128,7 @@ fn carry_out(mut operator: Operator, mut rehearsal: Option<Rehearsal>, typed: &R
             (_, Some(set), Some(rehearsal)) => rehearsal.change(&mut operator, set).map(|()| {
                 terminal.line(&format!("  {line}"));
             }),
-            (_, Some(_), None) => Err(Why::Unjudged.words()),
+            (_, Some(_), None) => Err(Reason::Unjudged.words()),
             (_, None, _) => {
                 terminal.error("type enable, arm, set PATH = VALUE or stop");
                 continue;

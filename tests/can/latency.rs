@@ -162,7 +162,7 @@ fn cycle(near: &str, rate_hz: u64, cycles: u64, planted: Planted, lock: &Mutex<u
     for k in 0..cycles + warm {
         if k == warm {
             outcome = Outcome::default();
-            faults_before = threads::suffered().page_faults;
+            faults_before = threads::interruptions().page_faults;
             FOREIGN.store(0, Ordering::Relaxed);
             HEAP.with(|calls| calls.set(0));
         }
@@ -196,7 +196,7 @@ fn cycle(near: &str, rate_hz: u64, cycles: u64, planted: Planted, lock: &Mutex<u
     }
     outcome.heap_calls = HEAP.with(Cell::get);
     outcome.foreign_calls = FOREIGN.load(Ordering::Relaxed);
-    outcome.page_faults = threads::suffered().page_faults - faults_before;
+    outcome.page_faults = threads::interruptions().page_faults - faults_before;
     std::hint::black_box(&record);
     // The loop's thread may make no more calls than a loop may: its resources are leaked until the process ends.
     std::mem::forget((bus, log, real_time, record));
@@ -360,7 +360,7 @@ fn whole_rig(cycles: u64) -> (Outcome, Counts, Option<End>) {
     while hil.ended().is_none() && hil.counts().cycles < cycles {
         hil.cycle();
         if hil.counts().cycles == warm && faults.is_none() {
-            faults = Some(threads::suffered().page_faults);
+            faults = Some(threads::interruptions().page_faults);
             watch_calls(fd);
             FOREIGN.store(0, Ordering::Relaxed);
             HEAP.with(|calls| calls.set(0));
@@ -369,7 +369,7 @@ fn whole_rig(cycles: u64) -> (Outcome, Counts, Option<End>) {
     let outcome = Outcome {
         heap_calls: HEAP.with(Cell::get),
         foreign_calls: FOREIGN.load(Ordering::Relaxed),
-        page_faults: faults.map_or(u64::MAX, |faults| threads::suffered().page_faults - faults),
+        page_faults: faults.map_or(u64::MAX, |faults| threads::interruptions().page_faults - faults),
         lateness: hil.counts().late.clone(),
         answer: Histogram::default(),
         missed: hil.counts().missed + hil.counts().stale,

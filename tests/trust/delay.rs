@@ -2,12 +2,12 @@
 
 use crate::chance::{Chance, seeds};
 use compiler::rig::Emulated;
-use runtime::coupling::loop_stability::{Late, Loop};
+use runtime::coupling::loop_stability::{CommandDelay, Loop};
 
 /// A contact with this natural frequency and damping ratio on an inertia of 1 kg·m².
 fn sampled(contact: Emulated) -> Loop {
     let Emulated { natural, damping_ratio, period, lag } = contact;
-    Loop::bristle(1.0, natural * natural, 2.0 * damping_ratio * natural, period, Late { dead: 0.0, lag })
+    Loop::bristle(1.0, natural * natural, 2.0 * damping_ratio * natural, period, CommandDelay { dead: 0.0, lag })
 }
 
 #[test]

@@ -56,7 +56,7 @@ impl Shaft {
 
 /// Delay of a command.
 #[derive(Clone, Copy, PartialEq, Debug)]
-pub struct Late {
+pub struct CommandDelay {
     /// Dead time from the reading to the begin of the effect, s.
     pub dead: f64,
     /// Time constant of the effect, s.
@@ -73,14 +73,14 @@ pub struct Loop {
     /// The shaft; its torques are the commands of the step, in the same order, and its signals are those of the step.
     pub shaft: Shaft,
     /// Delay of each command.
-    pub late: Vec<Late>,
+    pub late: Vec<CommandDelay>,
 }
 
 impl Loop {
     /// The loop of a bristle contact that sticks, on one inertia: z' = z + T v with the newest speed, F = σ0 z' + B v,
     /// like the compiled step of LuGre at rest. `sigma0` in N·m/rad, `damping` B in N·m·s/rad: with this small model
     /// the loop of a program can be compared.
-    pub fn bristle(inertia: f64, sigma0: f64, damping: f64, period: f64, late: Late) -> Loop {
+    pub fn bristle(inertia: f64, sigma0: f64, damping: f64, period: f64, late: CommandDelay) -> Loop {
         let step = Step {
             states: 1,
             signals: 1,
@@ -264,7 +264,7 @@ pub struct Ahead {
     /// Sign with which the command accelerates the observed position.
     pub sign: f64,
     /// Dead time and lag that the observer assumes.
-    pub told: Late,
+    pub told: CommandDelay,
 }
 
 impl Ahead {
@@ -349,7 +349,7 @@ mod tests {
         let lag = lag_of(hertz);
         let sigma0 = 1e5;
         let damping = 2.0 * zeta * f64::sqrt(sigma0);
-        let contact = Loop::bristle(1.0, sigma0, damping, period, Late { dead: 0.0, lag });
+        let contact = Loop::bristle(1.0, sigma0, damping, period, CommandDelay { dead: 0.0, lag });
         1e3 * (0.5 * period + lag + contact.limit(0).unwrap())
     }
 
@@ -373,7 +373,7 @@ mod tests {
 
     /// The nonlinear loop: a bristle with any amplitude, the drive with dead time and lag, the shaft in fine steps.
     /// Returns whether a small deflection decays.
-    fn dies_out(inertia: f64, sigma0: f64, damping: f64, period: f64, late: Late) -> bool {
+    fn dies_out(inertia: f64, sigma0: f64, damping: f64, period: f64, late: CommandDelay) -> bool {
         let period_ns = (period * 1e9).round() as u64;
         let fc = 1.0;
         let g = |v: f64| fc * (1.0 + 0.5 * (-(v / 1e-3) * (v / 1e-3)).exp());
@@ -431,7 +431,7 @@ mod tests {
     #[test]
     fn the_simulated_radius_agrees_with_the_eigenvalues() {
         for (dead, zeta) in [(0.2e-3, 0.5), (0.8e-3, 0.5), (1.6e-3, 0.5), (2.4e-3, 0.5), (0.3e-3, 0.1)] {
-            let late = Late { dead, lag: lag_of(500.0) };
+            let late = CommandDelay { dead, lag: lag_of(500.0) };
             let plain = Loop::bristle(1.0, 1e5, 2.0 * zeta * f64::sqrt(1e5), 1e-3, late);
             let (exact, run) = (plain.radius(), ahead(plain, 1.0).radius());
             assert!((run - exact).abs() < 2e-3, "{dead} {zeta}: {run} for {exact}");
@@ -442,7 +442,7 @@ mod tests {
     /// that.
     #[test]
     fn prediction_stabilises_a_delayed_contact() {
-        let late = Late { dead: 4.5e-3, lag: lag_of(500.0) };
+        let late = CommandDelay { dead: 4.5e-3, lag: lag_of(500.0) };
         let plain = Loop::bristle(1.0, 1e5, f64::sqrt(1e5), 1e-3, late);
         assert!(plain.radius() > 1.0);
         let mut looking = ahead(plain, 1.0);
@@ -471,7 +471,7 @@ mod tests {
         }
         let judged = grid.par_iter().map(|&(inertia, natural, zeta, lag, period): &(f64, f64, f64, f64, f64)| {
             let (sigma0, damping) = (inertia * natural * natural, 2.0 * zeta * inertia * natural);
-            let late = |dead: f64| Late { dead, lag };
+            let late = |dead: f64| CommandDelay { dead, lag };
             let predicted = Loop::bristle(inertia, sigma0, damping, period, late(0.0)).limit(0).unwrap();
             let total = 0.5 * period + lag + predicted;
             // None if lag and period alone are too long, or so long that 5 % less would require a negative dead time.

@@ -11,7 +11,7 @@ use crate::canopen::pdo::{Direction, Mapped, Pdo};
 use crate::canopen::sdo::Client;
 use crate::canopen::service::{self, Service};
 use crate::canopen::{NmtState, Object, Send, Type};
-use crate::drive::faults::{Reading, TroubleKind, Why};
+use crate::drive::faults::{Reading, RefusalReason, TroubleKind};
 use crate::drive::sdo_sequence::{Entry, Keep, Progress, Question, Script, Watching};
 use crate::safety::{Protection, is_present};
 use abi::rig::{Cia402, Mode, What};
@@ -360,7 +360,7 @@ impl Drive {
     }
 
     /// Entries that depend on the mode of operation, once it has been chosen.
-    fn mode_list(&self) -> Result<Vec<Entry>, Why> {
+    fn mode_list(&self) -> Result<Vec<Entry>, RefusalReason> {
         let mut list = Vec::with_capacity(8);
         if self.mode == 4 {
             // The drive's own rate limiter: set to the slew limit of the rig, or disabled.
@@ -369,7 +369,8 @@ impl Drive {
             list.push(Entry::Compare(Object(0x6087, 0), slope, 0xFFFF_FFFF));
         }
         if self.mode >= 8 {
-            let (value, exponent) = interpolation(self.setting.period_ns).ok_or(Why::Period(self.setting.period_ns))?;
+            let (value, exponent) =
+                interpolation(self.setting.period_ns).ok_or(RefusalReason::Period(self.setting.period_ns))?;
             list.push(Entry::WriteOr(Object(0x60C2, 1), value, 1, 3));
             list.push(Entry::Write(Object(0x60C2, 2), exponent, 1));
             list.push(Entry::Compare(Object(0x60C2, 1), value, 0xFF));
@@ -673,7 +674,7 @@ impl Drive {
     }
 
     /// One step of the identification. Also polls the SDO client for time-outs.
-    pub(super) fn identify(&mut self, now_ns: u64, send: Send) -> Result<bool, Why> {
+    pub(super) fn identify(&mut self, now_ns: u64, send: Send) -> Result<bool, RefusalReason> {
         self.client.poll(now_ns, send);
         match self.identity.work(&mut self.client, now_ns, send) {
             Progress::Busy => Ok(false),
@@ -683,11 +684,11 @@ impl Drive {
         }
     }
 
-    fn judge_identity(&mut self) -> Result<(), Why> {
+    fn judge_identity(&mut self) -> Result<(), RefusalReason> {
         let get = |keep| self.identity.get(keep);
         let kind = get(Keep::DeviceType).unwrap_or(0) as u32;
         if kind & 0xFFFF != self.profile.device.into() {
-            return Err(Why::DeviceType(kind));
+            return Err(RefusalReason::DeviceType(kind));
         }
         let path = match self.config.mode {
             Mode::Torque => self.profile.torque,
@@ -699,27 +700,27 @@ impl Drive {
             None => path.modes[0].0,
             Some(offered) => {
                 let mode = path.modes.iter().find(|(_, bit)| offered >> bit & 1 == 1);
-                mode.ok_or(Why::NoMode(offered as u32))?.0
+                mode.ok_or(RefusalReason::NoMode(offered as u32))?.0
             }
         };
         if let Some(rated) = get(Keep::RatedTorque) {
             let rated = rated as f64 * 1e-3;
             if (rated - self.config.rated_torque).abs() > 0.01 * self.config.rated_torque {
-                return Err(Why::RatedTorque(rated, self.config.rated_torque));
+                return Err(RefusalReason::RatedTorque(rated, self.config.rated_torque));
             }
         }
         let own_torque = get(Keep::MaxTorque).map(|number| self.torque.value(number));
         let rpm = std::f64::consts::PI / 30.0;
         let own_speed = get(Keep::MaxSpeed).map(|number| number as f64 * rpm);
-        let torque = self.config.max_torque.or(own_torque).ok_or(Why::NoLimit("torque"))?;
-        let speed = self.config.max_speed.or(own_speed).ok_or(Why::NoLimit("speed"))?;
+        let torque = self.config.max_torque.or(own_torque).ok_or(RefusalReason::NoLimit("torque"))?;
+        let speed = self.config.max_speed.or(own_speed).ok_or(RefusalReason::NoLimit("speed"))?;
         self.limits = Limits { torque, speed, power: self.config.max_power.unwrap_or(torque * speed) };
         self.error_code = get(Keep::Error).unwrap_or(0) as u16;
         Ok(())
     }
 
     /// One step of the configuration.
-    pub(super) fn configure(&mut self, now_ns: u64, send: Send) -> Result<bool, Why> {
+    pub(super) fn configure(&mut self, now_ns: u64, send: Send) -> Result<bool, RefusalReason> {
         self.client.poll(now_ns, send);
         match self.configuration.work(&mut self.client, now_ns, send) {
             Progress::Busy => Ok(false),
@@ -728,7 +729,7 @@ impl Drive {
                 Ok(true)
             }
             Progress::Refused(why) => Err(why),
-            Progress::Asks(Question::Timeout(Watching::Nothing)) => Err(Why::NoTimeout),
+            Progress::Asks(Question::Timeout(Watching::Nothing)) => Err(RefusalReason::NoTimeout),
             Progress::Asks(Question::Timeout(watching)) => {
                 // From now on the drive monitors us, and we monitor the drive.
                 (self.watching, self.heard_ns) = (Some(watching), Some(now_ns));
@@ -738,14 +739,14 @@ impl Drive {
                 Some(1..=3) => Ok(false),
                 found => {
                     let found = found.unwrap_or(0);
-                    Err(Why::ReadBack { object: Object(0x605A, 0), wanted: 2, found })
+                    Err(RefusalReason::ReadBack { object: Object(0x605A, 0), wanted: 2, found })
                 }
             },
         }
     }
 
     /// One step of setting the mode of operation; the mode display is read repeatedly until it agrees.
-    pub(super) fn give_mode(&mut self, now_ns: u64, send: Send) -> Result<bool, Why> {
+    pub(super) fn give_mode(&mut self, now_ns: u64, send: Send) -> Result<bool, RefusalReason> {
         self.client.poll(now_ns, send);
         match self.mode_script.work(&mut self.client, now_ns, send) {
             Progress::Busy | Progress::Asks(_) => Ok(false),
@@ -762,15 +763,15 @@ impl Drive {
     }
 
     /// The refusal if its mode display never agreed.
-    pub(super) fn wrong_mode(&self) -> Why {
-        Why::Mode { wanted: self.mode, shown: self.mode_shown.unwrap_or(0) }
+    pub(super) fn wrong_mode(&self) -> RefusalReason {
+        RefusalReason::Mode { wanted: self.mode, shown: self.mode_shown.unwrap_or(0) }
     }
 
     /// The refusal if it was never enabled.
-    pub(super) fn not_enabled(&self) -> Why {
+    pub(super) fn not_enabled(&self) -> RefusalReason {
         match self.state() {
             State::Enabled => self.wrong_mode(),
-            state => Why::NotEnabled(state, self.error_code),
+            state => RefusalReason::NotEnabled(state, self.error_code),
         }
     }
 

@@ -103,12 +103,12 @@ pub struct Refusal {
     /// The node (index into the rig's nodes) that causes it, if any.
     pub node: Option<usize>,
     /// The reason.
-    pub why: Why,
+    pub why: RefusalReason,
 }
 
 /// Reason of a refusal.
 #[derive(Clone, Copy, PartialEq, Debug)]
-pub enum Why {
+pub enum RefusalReason {
     /// Another participant acts as a master: identifier of its frame.
     ForeignMaster(u32),
     /// No boot-up message or heartbeat after a reset.
@@ -174,77 +174,83 @@ pub enum Why {
     Trouble(TroubleKind),
 }
 
-impl fmt::Display for Why {
+impl fmt::Display for RefusalReason {
     fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
         match *self {
-            Why::ForeignMaster(id) if id & 0x780 == 0x700 => stranger(f, id),
-            Why::ForeignMaster(id) => write!(
+            RefusalReason::ForeignMaster(id) if id & 0x780 == 0x700 => stranger(f, id),
+            RefusalReason::ForeignMaster(id) => write!(
                 f,
                 "somebody else sends frame 0x{id:03X}, which only a master sends; two masters on a bus fight: take \
                  the other one off"
             ),
-            Why::Silent => write!(
+            RefusalReason::Silent => write!(
                 f,
                 "it does not answer a reset of communication: is it powered, has it this node id, is the bit rate right?"
             ),
-            Why::Sdo { object, write, failure } => {
+            RefusalReason::Sdo { object, write, failure } => {
                 write!(f, "object {object} could not be {}: {failure}", if write { "written" } else { "read" })
             }
-            Why::ReadBack { object, wanted, found } => {
+            RefusalReason::ReadBack { object, wanted, found } => {
                 write!(f, "object {object} was set to {wanted} (0x{wanted:X}) and holds {found} (0x{found:X})")
             }
-            Why::DeviceType(found) => {
+            RefusalReason::DeviceType(found) => {
                 write!(f, "object 1000 is 0x{found:08X}: no drive with profile 402 (0x....0192)")
             }
-            Why::RatedTorque(drive, rig) => write!(
+            RefusalReason::RatedTorque(drive, rig) => write!(
                 f,
                 "its rated torque is {drive} N·m (object 6076), the rig says {rig} N·m: correct `T_rated`, or the \
                  node id"
             ),
-            Why::NoLimit(which) => {
+            RefusalReason::NoLimit(which) => {
                 write!(f, "neither the rig nor the drive says its greatest {which}: give `{which}_max`")
             }
-            Why::NoMode(modes) => write!(f, "it offers no mode for this command (object 6502 is 0x{modes:08X})"),
-            Why::Period(period_ns) => write!(
+            RefusalReason::NoMode(modes) => {
+                write!(f, "it offers no mode for this command (object 6502 is 0x{modes:08X})")
+            }
+            RefusalReason::Period(period_ns) => write!(
                 f,
                 "a period of {} µs can't be told to it (object 60C2 takes 1 to 255 times a power of ten)",
                 period_ns as f64 / 1e3
             ),
-            Why::NoTimeout => write!(
+            RefusalReason::NoTimeout => write!(
                 f,
                 "it has no means to notice that we are gone: neither heartbeat consumer (1016) nor node guarding (100C)"
             ),
-            Why::NotOperational(state) => write!(f, "it was started and is {state}"),
-            Why::Missed(missed, of) => write!(f, "{missed} of {of} answers to SYNC were late or missing"),
-            Why::Mode { wanted, shown } => write!(f, "it was given mode {wanted} and shows mode {shown}"),
-            Why::NotEnabled(state, 0) => write!(f, "it stays in \"{state}\""),
-            Why::NotEnabled(state, code) => {
+            RefusalReason::NotOperational(state) => write!(f, "it was started and is {state}"),
+            RefusalReason::Missed(missed, of) => write!(f, "{missed} of {of} answers to SYNC were late or missing"),
+            RefusalReason::Mode { wanted, shown } => write!(f, "it was given mode {wanted} and shows mode {shown}"),
+            RefusalReason::NotEnabled(state, 0) => write!(f, "it stays in \"{state}\""),
+            RefusalReason::NotEnabled(state, code) => {
                 let text = crate::canopen::service::error_meaning(code);
                 write!(f, "it stays in \"{state}\", error 0x{code:04X}: {text}")
             }
-            Why::TimeoutIgnored(ms) => {
+            RefusalReason::TimeoutIgnored(ms) => {
                 write!(f, "our life sign had stopped for {ms} ms and it was still enabled: its time-out does not work")
             }
-            Why::Stuck(command) => write!(f, "it did not move at {command:.3}: is it blocked, or its brake closed?"),
-            Why::NotTurned(angle) => write!(
+            RefusalReason::Stuck(command) => {
+                write!(f, "it did not move at {command:.3}: is it blocked, or its brake closed?")
+            }
+            RefusalReason::NotTurned(angle) => write!(
                 f,
                 "its position did not change by {angle:.2} rad although the shaft was to be turned: is its encoder connected, \
                  and the shaft coupled?"
             ),
-            Why::WrongSign => write!(f, "it turned against the command: sign of torque or of position is swapped"),
-            Why::Ran(angle, speed) => {
+            RefusalReason::WrongSign => {
+                write!(f, "it turned against the command: sign of torque or of position is swapped")
+            }
+            RefusalReason::Ran(angle, speed) => {
                 write!(f, "the first motion went too far: {angle:.3} rad at {speed:.2} rad/s")
             }
-            Why::Scale(position, speed) => write!(
+            RefusalReason::Scale(position, speed) => write!(
                 f,
                 "by its position it turned by {position:.4} rad, by its speed by {speed:.4} rad: `count` or \
                  `speed_unit` is wrong"
             ),
-            Why::Torque(told, applied) => write!(
+            RefusalReason::Torque(told, applied) => write!(
                 f,
                 "it was told {told:.4} N·m s and reports {applied:.4} N·m s: scale or sign of its torque is wrong"
             ),
-            Why::Trouble(kind) => kind.fmt(f),
+            RefusalReason::Trouble(kind) => kind.fmt(f),
         }
     }
 }

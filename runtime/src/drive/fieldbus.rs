@@ -12,7 +12,7 @@ use crate::can::Frame;
 use crate::canopen::service::{self, Service};
 use crate::canopen::{Nmt, NmtState};
 use crate::drive::cia402::{Drive, Limits, Setting, Status};
-use crate::drive::faults::{Reading, Refusal, Trouble, TroubleKind, Why};
+use crate::drive::faults::{Reading, Refusal, RefusalReason, Trouble, TroubleKind};
 use crate::drive::polarity_check::{Bounds, PATIENCE, PATIENCE_BY_HAND, Push, Sample, SignTest, Verdict};
 use crate::drive::sdo_sequence::Watching;
 use crate::safety::{Protection, is_present};
@@ -475,7 +475,7 @@ impl Fieldbus {
         match self.step {
             Step::Listen => {
                 if let TroubleKind::ForeignMaster(id) = kind {
-                    self.refuse(None, Why::ForeignMaster(id));
+                    self.refuse(None, RefusalReason::ForeignMaster(id));
                 }
             }
             Step::Reset if !foreign => {}
@@ -484,11 +484,11 @@ impl Fieldbus {
             Step::AwaitEnable | Step::Enable if answer => {}
             Step::AwaitArm | Step::Armed | Step::Stopped => self.push_trouble(Trouble { node, kind, stamp_ns }),
             Step::Refused => {}
-            _ => self.refuse(node, Why::Trouble(kind)),
+            _ => self.refuse(node, RefusalReason::Trouble(kind)),
         }
     }
 
-    fn refuse(&mut self, node: Option<usize>, why: Why) {
+    fn refuse(&mut self, node: Option<usize>, why: RefusalReason) {
         self.refusal = Some(Refusal { node, why });
         self.go(Step::Refused);
         self.aim(Goal::Off, false);
@@ -603,7 +603,7 @@ impl Fieldbus {
     fn each(
         &mut self,
         send: Send,
-        mut work: impl FnMut(&mut Drive, crate::canopen::Send) -> Result<bool, Why>,
+        mut work: impl FnMut(&mut Drive, crate::canopen::Send) -> Result<bool, RefusalReason>,
     ) -> bool {
         for at in 0..self.nodes.len() {
             let Node::Drive(drive) = &mut self.nodes[at] else { continue };
@@ -623,7 +623,7 @@ impl Fieldbus {
     }
 
     /// Refuses the first drive that has not completed the step, if the step has taken too long.
-    fn within(&mut self, limit_ns: u64, lasted_ns: u64, why: impl Fn(&Drive) -> Why) {
+    fn within(&mut self, limit_ns: u64, lasted_ns: u64, why: impl Fn(&Drive) -> RefusalReason) {
         if lasted_ns < limit_ns || self.step == Step::Refused {
             return;
         }
@@ -659,19 +659,19 @@ impl Fieldbus {
                 if all {
                     return self.go(Step::Identity);
                 }
-                self.within(BOOT_NS, lasted_ns, |_| Why::Silent);
+                self.within(BOOT_NS, lasted_ns, |_| RefusalReason::Silent);
             }
             Step::Identity => {
                 if self.each(send, |drive, send| drive.identify(now_ns, send)) {
                     return self.go(Step::Configure);
                 }
-                self.within(IDENTITY_NS, lasted_ns, |_| Why::Silent);
+                self.within(IDENTITY_NS, lasted_ns, |_| RefusalReason::Silent);
             }
             Step::Configure => {
                 if self.each(send, |drive, send| drive.configure(now_ns, send)) {
                     return self.go(Step::Start);
                 }
-                self.within(CONFIGURE_NS, lasted_ns, |_| Why::Silent);
+                self.within(CONFIGURE_NS, lasted_ns, |_| RefusalReason::Silent);
             }
             Step::Start => {
                 let all = self.each(send, |drive, send| {
@@ -686,7 +686,7 @@ impl Fieldbus {
                     self.running = true;
                     return self.go(Step::Sync);
                 }
-                self.within(START_NS, lasted_ns, |drive| Why::NotOperational(drive.nmt()));
+                self.within(START_NS, lasted_ns, |drive| RefusalReason::NotOperational(drive.nmt()));
             }
             Step::Sync => self.count_answers(lasted_ns),
             Step::Mode => {
@@ -716,7 +716,7 @@ impl Fieldbus {
             let most = f64::from(self.answers) * self.options.missed;
             let worst = (0..self.nodes.len()).find(|at| f64::from(self.missed[*at]) > most);
             match worst {
-                Some(at) => self.refuse(Some(at), Why::Missed(self.missed[at], self.answers)),
+                Some(at) => self.refuse(Some(at), RefusalReason::Missed(self.missed[at], self.answers)),
                 None => self.go(Step::Mode),
             }
         }
@@ -790,7 +790,7 @@ impl Fieldbus {
                 Some(_) => status.timeout.map_or(0, |(ms, _)| ms),
             };
             if waited > u64::from(limit_ms) * 1_500_000 + heartbeat + slack {
-                return Err(Why::TimeoutIgnored(waited / 1_000_000));
+                return Err(RefusalReason::TimeoutIgnored(waited / 1_000_000));
             }
             Ok(false)
         });

@@ -24,7 +24,7 @@ pub mod serve;
 pub use crate::drive::bus_stub::attend;
 pub use crate::drive::cia402::{Limits, Status};
 pub use crate::drive::fault_injection::{Effect, Hook, Start};
-pub use crate::drive::faults::{Reading, Refusal, Trouble, TroubleKind, Why};
+pub use crate::drive::faults::{Reading, Refusal, RefusalReason, Trouble, TroubleKind};
 pub use crate::drive::simulated_plant::{Bench, Shaft};
 pub use fieldbus::{Fieldbus, Options, Request, Step};
 

@@ -4,7 +4,7 @@
 //! turned a little; then the same torques follow in reverse order and with the opposite sign, which removes the speed
 //! again.
 
-use crate::drive::faults::Why;
+use crate::drive::faults::RefusalReason;
 use abi::rig::Mode;
 
 /// Kind of the polarity check.
@@ -98,7 +98,7 @@ pub enum Verdict {
     /// The check has passed.
     Right,
     /// The check has failed.
-    Wrong(Why),
+    Wrong(RefusalReason),
 }
 
 impl Push {
@@ -144,21 +144,21 @@ impl Push {
         self.t += dt;
         let bounds = self.bounds;
         if self.turned.is_none() && (turned.abs() > bounds.angle_most || speed.abs() > bounds.speed_most) {
-            return Verdict::Wrong(Why::Ran(turned, speed));
+            return Verdict::Wrong(RefusalReason::Ran(turned, speed));
         }
         let patience = self.turned.unwrap_or(PATIENCE);
         let slope = bounds.command / RISE;
         match self.phase {
             Phase::Push if turned.abs() >= bounds.angle => {
                 if turned < 0.0 && self.turned.is_none() {
-                    return Verdict::Wrong(Why::WrongSign);
+                    return Verdict::Wrong(RefusalReason::WrongSign);
                 }
                 (self.phase, self.rise, self.t) = (Phase::Back, self.t, 0.0);
             }
             Phase::Push if self.t > patience => {
                 return Verdict::Wrong(match self.turned {
-                    None => Why::Stuck(bounds.command),
-                    Some(_) => Why::NotTurned(bounds.angle),
+                    None => RefusalReason::Stuck(bounds.command),
+                    Some(_) => RefusalReason::NotTurned(bounds.angle),
                 });
             }
             Phase::Push => {}
@@ -198,18 +198,18 @@ impl Push {
     }
 
     /// The scale error, if any, once the shaft has turned and its speed has been removed again.
-    fn judge(&self, turned: f64, sample: Sample) -> Option<Why> {
+    fn judge(&self, turned: f64, sample: Sample) -> Option<RefusalReason> {
         let bounds = self.bounds;
         let seconds = self.rise + self.t;
         // A coarsely quantised speed may be off by one step all the time.
         let slack = 0.3 * turned.abs().max(bounds.angle) + bounds.speed_unit * seconds;
         if sample.speed.is_some() && (self.turned_by_speed - turned).abs() > slack {
-            return Some(Why::Scale(turned, self.turned_by_speed));
+            return Some(RefusalReason::Scale(turned, self.turned_by_speed));
         }
         let slack = 0.5 * self.told + bounds.torque_unit * seconds;
         let has_torque = bounds.mode == Mode::Torque && self.turned.is_none() && sample.torque.is_some();
         if has_torque && (self.reported - self.told).abs() > slack {
-            return Some(Why::Torque(self.told, self.reported));
+            return Some(RefusalReason::Torque(self.told, self.reported));
         }
         None
     }
@@ -260,22 +260,22 @@ mod tests {
 
     #[test]
     fn wrong_signs_and_scales_are_reported() {
-        assert_eq!(run(BOUNDS, 0.1, [-1.0, 1.0, 1.0]).0, Verdict::Wrong(Why::WrongSign));
-        assert_eq!(run(BOUNDS, 0.1, [1.0, -1.0, -1.0]).0, Verdict::Wrong(Why::WrongSign));
+        assert_eq!(run(BOUNDS, 0.1, [-1.0, 1.0, 1.0]).0, Verdict::Wrong(RefusalReason::WrongSign));
+        assert_eq!(run(BOUNDS, 0.1, [1.0, -1.0, -1.0]).0, Verdict::Wrong(RefusalReason::WrongSign));
         for factor in [-1.0, 0.1, 10.0] {
             let (verdict, ..) = run(BOUNDS, 0.1, [1.0, factor, 1.0]);
-            assert!(matches!(verdict, Verdict::Wrong(Why::Scale(..))), "speed by {factor}: {verdict:?}");
+            assert!(matches!(verdict, Verdict::Wrong(RefusalReason::Scale(..))), "speed by {factor}: {verdict:?}");
         }
         let (verdict, ..) = run(BOUNDS, 0.1, [4.0, 1.0, 1.0]);
-        assert!(matches!(verdict, Verdict::Wrong(Why::Torque(..))), "{verdict:?}");
-        assert_eq!(run(BOUNDS, 2.0, [1.0; 3]).0, Verdict::Wrong(Why::Stuck(1.0)));
+        assert!(matches!(verdict, Verdict::Wrong(RefusalReason::Torque(..))), "{verdict:?}");
+        assert_eq!(run(BOUNDS, 2.0, [1.0; 3]).0, Verdict::Wrong(RefusalReason::Stuck(1.0)));
         // The shaft is to be turned from outside, but the drive does not see a motion.
         let mut turned = Push::new(BOUNDS, Some(0.5));
         let still = Sample { position: 1.0, speed: Some(0.0), torque: Some(0.0) };
         let verdicts: Vec<Verdict> = (0..502).map(|_| turned.tick(still, 1e-3)).collect();
         assert_eq!(verdicts[..499], [Verdict::Wants(0.0); 499]);
-        assert_eq!(verdicts[501], Verdict::Wrong(Why::NotTurned(BOUNDS.angle)));
+        assert_eq!(verdicts[501], Verdict::Wrong(RefusalReason::NotTurned(BOUNDS.angle)));
         let tight = Bounds { speed_most: 0.01, ..BOUNDS };
-        assert!(matches!(run(tight, 0.0, [1.0; 3]).0, Verdict::Wrong(Why::Ran(..))));
+        assert!(matches!(run(tight, 0.0, [1.0; 3]).0, Verdict::Wrong(RefusalReason::Ran(..))));
     }
 }

@@ -2,7 +2,7 @@
 
 use crate::canopen::sdo::{Client, Failure, Outcome};
 use crate::canopen::{Object, Send, Type};
-use crate::drive::faults::Why;
+use crate::drive::faults::RefusalReason;
 
 /// One entry of a sequence.
 #[derive(Clone, Copy, PartialEq, Debug)]
@@ -85,7 +85,7 @@ pub enum Progress {
     /// The sequence is complete.
     Done,
     /// The drive refused an entry.
-    Refused(Why),
+    Refused(RefusalReason),
 }
 
 /// Attempts if a drive does not answer: it may be busy, or an answer may be lost.
@@ -182,7 +182,7 @@ impl Script {
                     }
                     _ => {
                         let write = matches!(entry, Entry::Write(..) | Entry::WriteOr(..) | Entry::Watch(..));
-                        return Progress::Refused(Why::Sdo { object: client.object(), write, failure });
+                        return Progress::Refused(RefusalReason::Sdo { object: client.object(), write, failure });
                     }
                 }
                 Progress::Busy
@@ -218,6 +218,6 @@ impl Script {
     }
 }
 
-fn differs(object: Object, wanted: i64, found: i64) -> Option<Why> {
-    (found != wanted).then_some(Why::ReadBack { object, wanted, found })
+fn differs(object: Object, wanted: i64, found: i64) -> Option<RefusalReason> {
+    (found != wanted).then_some(RefusalReason::ReadBack { object, wanted, found })
 }

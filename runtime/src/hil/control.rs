@@ -9,7 +9,7 @@ use super::followed::Followed;
 use super::watches::{self, Bounds, bounds_of};
 use crate::coupling::predictor::Wired;
 use crate::drive::profiles;
-use crate::safety::{Cause, DriveCommand, Protection, Seen, Supervisor, Timeouts, is_present};
+use crate::safety::{Cause, DriveCommand, Measured, Protection, Supervisor, Timeouts, is_present};
 use abi::rig::{Kind, Overrun, Rig, Signal, What};
 use abi::{Instance, Slot};
 
@@ -40,7 +40,7 @@ pub enum Source {
 
 /// Inputs of one cycle.
 #[derive(Clone, Copy, PartialEq, Debug)]
-pub struct Told<'a> {
+pub struct CycleInputs<'a> {
     /// Ticks since the last cycle: 1, more after missed ticks.
     pub ticks: u32,
     /// Delay of the cycle's start after its tick, ns: less than a period.
@@ -193,7 +193,7 @@ pub struct Control {
     stops: Vec<Slot>,
     /// For each drive: the indices of its speed and position among the signals.
     seen_at: Vec<(Option<usize>, Option<usize>)>,
-    seen: Vec<Seen>,
+    seen: Vec<Measured>,
     paired: Vec<Paired>,
     followed: Vec<Followed>,
     /// The drive command of the last cycle was to follow.
@@ -298,7 +298,8 @@ impl Control {
             // A drive described by frames may send less often than the rig reads: without `timeout` it never counts as
             // lost.
             let needed = matches!(rig.nodes[*node].kind, Kind::Cia402(_)) || rig.nodes[*node].timeout_ns > 0;
-            let mut measured = |what| watches::told(rig, *node, what).map(|signal| watch(signal, 0.0, needed));
+            let mut measured =
+                |what| watches::measured_signal(rig, *node, what).map(|signal| watch(signal, 0.0, needed));
             measured(What::Torque);
             (measured(What::Speed), measured(What::Position))
         });
@@ -340,7 +341,7 @@ impl Control {
             inputs,
             outputs: rig.outputs.iter().map(|output| output.slot).collect(),
             stops: rig.stops.iter().map(|stop| stop.slot).collect(),
-            seen: vec![Seen::default(); seen_at.len()],
+            seen: vec![Measured::default(); seen_at.len()],
             seen_at,
             paired,
             followed,
@@ -366,7 +367,7 @@ impl Control {
     }
 
     /// Measured values of each drive, without those that were rejected as implausible.
-    pub fn seen(&self) -> &[Seen] {
+    pub fn seen(&self) -> &[Measured] {
         &self.seen
     }
 
@@ -397,7 +398,7 @@ impl Control {
 
     /// One cycle. Any source but [`Source::Nobody`] requires an armed supervisor.
     #[cfg_attr(rtsan, sanitize(realtime = "nonblocking"))]
-    pub fn cycle(&mut self, told: &Told) -> DriveCommand {
+    pub fn cycle(&mut self, told: &CycleInputs) -> DriveCommand {
         assert_eq!(told.readings.len(), self.watched.len(), "readings");
         let armed = told.source != Source::Nobody;
         self.refused_set = None;
@@ -435,7 +436,7 @@ impl Control {
                 let watched = &self.watched[(*at)?];
                 watched.since.map(|_| watched.last)
             };
-            *seen = Seen { speed: last(speed), position: last(position) };
+            *seen = Measured { speed: last(speed), position: last(position) };
         }
         let order = self.supervisor.judge(&self.requests, &self.seen);
         if computes {
@@ -490,7 +491,7 @@ impl Control {
 
     /// Trips where position and speed of a drive have disagreed for too long: an encoder that stands still or loses
     /// counts.
-    fn compare(&mut self, told: &Told) {
+    fn compare(&mut self, told: &CycleInputs) {
         for pair in &mut self.paired {
             let [speed, position] = [pair.speed, pair.position].map(|at| &self.watched[at]);
             if told.source != Source::Model {
@@ -519,7 +520,7 @@ impl Control {
 
     /// Trips where a drive has not followed its commands for too long. The permitted outputs are still those of the
     /// last cycle.
-    fn compare_commands(&mut self, told: &Told) {
+    fn compare_commands(&mut self, told: &CycleInputs) {
         for followed in &mut self.followed {
             let answer = &self.watched[followed.signal];
             let sent = self.supervisor.permitted()[followed.output];
@@ -536,7 +537,7 @@ impl Control {
     }
 
     /// Advances the model to the end of this tick.
-    fn advance(&mut self, told: &Told) {
+    fn advance(&mut self, told: &CycleInputs) {
         for (at, slot) in &self.inputs {
             self.model.set(*slot, self.watched[*at].last);
         }
@@ -709,7 +710,7 @@ mod tests {
             let torque = at(What::Torque);
             self.readings[torque].value = self.control.supervisor().permitted()[0];
             let (source, wanted, causes) = (Source::Model, &[][..], &[][..]);
-            let told = Told { ticks, late_ns: 0, readings: &self.readings, source, wanted, causes, set };
+            let told = CycleInputs { ticks, late_ns: 0, readings: &self.readings, source, wanted, causes, set };
             self.control.cycle(&told);
             self.control.supervisor().permitted()[0]
         }
@@ -768,7 +769,8 @@ mod tests {
                 assert_eq!(way.control.supervisor().cause(), None, "cycle {cycle}");
                 way.readings[at].value = bad;
                 let (source, wanted, causes) = (Source::Model, &[][..], &[][..]);
-                let told = Told { ticks: 1, late_ns: 0, readings: &way.readings, source, wanted, causes, set: &[] };
+                let told =
+                    CycleInputs { ticks: 1, late_ns: 0, readings: &way.readings, source, wanted, causes, set: &[] };
                 way.control.cycle(&told);
                 assert!(way.control.watched[at].last.is_finite());
             }
@@ -833,7 +835,15 @@ mod tests {
                 let mut readings: Vec<Reading> = control.signals().map(reading).collect();
                 readings[at] = Reading { value: newest, age };
                 let (source, wanted, causes) = (Source::Model, &[][..], &[][..]);
-                control.cycle(&Told { ticks: 1, late_ns: 0, readings: &readings, source, wanted, causes, set: &[] });
+                control.cycle(&CycleInputs {
+                    ticks: 1,
+                    late_ns: 0,
+                    readings: &readings,
+                    source,
+                    wanted,
+                    causes,
+                    set: &[],
+                });
                 assert_eq!(control.watched[at].last, number, "seed {seed}, cycle {k}");
                 let lost = timeout > 0 && u64::from(since) >= timeout;
                 let cause = match (lost, none >= ODD) {

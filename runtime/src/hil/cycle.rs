@@ -8,10 +8,10 @@
 //! in [`Control`], commands, housekeeping. From the moment when drives may move, a cycle neither allocates nor locks
 //! nor writes anything but frames; its records pass through queues that never block.
 
-use super::control::{Control, Reading, Source, Told};
+use super::control::{Control, CycleInputs, Reading, Source};
 use super::counts::Counts;
 use super::live::{Judge, Objection};
-use super::operator::{self, Answer, Commands, Why};
+use super::operator::{self, Answer, Commands, Reason};
 pub use super::operator::{Command, Operator};
 use super::stage::{Stage, StageGauge};
 use super::trace::{self, Passed, Shape};
@@ -22,7 +22,7 @@ use crate::coupling::predictor::Wired;
 use crate::drive::{self, Fieldbus, Request, Step, Trouble, TroubleKind, timing};
 use crate::realtime::clock::Clock;
 use crate::record::log::{self, Log, Sections};
-use crate::safety::{Cause, Clamps, DriveCommand, Protection, Seen, Supervisor, is_present};
+use crate::safety::{Cause, Clamps, DriveCommand, Measured, Protection, Supervisor, is_present};
 use abi::Instance;
 use abi::rig::{Rig, Signal};
 use std::io;
@@ -123,7 +123,7 @@ struct Wires {
 impl Wires {
     /// Sends a frame. After the watchdog has stopped the drives, nothing is sent until the cycle stops them too.
     fn send(&mut self, bus: usize, frame: Frame) {
-        let bitten = self.watchdog.as_ref().is_some_and(emergency::Watchdog::has_bitten);
+        let bitten = self.watchdog.as_ref().is_some_and(emergency::Watchdog::has_fired);
         if bitten && !self.acknowledged && is_present(Protection::Hushed) {
             return;
         }
@@ -340,7 +340,7 @@ impl Hil {
     }
 
     /// Measured values of each drive, without those that were rejected as implausible.
-    pub fn seen(&self) -> &[Seen] {
+    pub fn seen(&self) -> &[Measured] {
         self.control.as_ref().map_or(&[], Control::seen)
     }
 
@@ -467,21 +467,21 @@ impl Hil {
         let now_ns = self.wires.clock.now_ns();
         self.commands.begin(now_ns);
         // A stop takes precedence: all commands beside it are refused.
-        let stops = self.over || emergency::asked().is_some() | self.commands.takes_stop();
+        let stops = self.over || emergency::requested_stop().is_some() | self.commands.takes_stop();
         if stops {
             self.stop();
         }
         while let Some(said) = self.commands.next(now_ns, false) {
             let has_effect = match said.command {
                 _ if stops => {
-                    self.commands.answer(said.number, Answer::Refused(Why::Stopping));
+                    self.commands.answer(said.number, Answer::Refused(Reason::Stopping));
                     continue;
                 }
                 Command::Enable => self.fieldbus.request(Request::Enable),
                 Command::Arm => self.fieldbus.request(Request::Arm),
                 Command::Stop | Command::Set(_) => unreachable!("neither comes this way"),
             };
-            let answer = if has_effect { Answer::Taken } else { Answer::Refused(Why::NotNow(self.stage())) };
+            let answer = if has_effect { Answer::Taken } else { Answer::Refused(Reason::NotNow(self.stage())) };
             self.commands.answer(said.number, answer);
         }
         if self.options.checks_only && self.fieldbus.step() == Step::AwaitArm {
@@ -504,9 +504,9 @@ impl Hil {
         let Some(said) = self.commands.next(self.wires.clock.now_ns(), true) else { return };
         let Command::Set(set) = said.command else { unreachable!("only a set was asked for") };
         let refused = match (&self.control, &mut self.judge) {
-            (None, _) => Some(Why::NotNow(self.stage())),
-            (Some(_), None) => Some(Why::Unjudged),
-            (Some(control), Some(judge)) => judge.judge(control.model().block(), set.values()).err().map(Why::Set),
+            (None, _) => Some(Reason::NotNow(self.stage())),
+            (Some(_), None) => Some(Reason::Unjudged),
+            (Some(control), Some(judge)) => judge.judge(control.model().block(), set.values()).err().map(Reason::Set),
         };
         match refused {
             Some(why) => {
@@ -537,7 +537,7 @@ impl Hil {
         if self.overload >= OVERLOAD && is_present(Protection::Overload) {
             self.wires.report(Cause::Overload(0));
         }
-        if self.wires.watchdog.as_ref().is_some_and(emergency::Watchdog::has_bitten) && !self.wires.acknowledged {
+        if self.wires.watchdog.as_ref().is_some_and(emergency::Watchdog::has_fired) && !self.wires.acknowledged {
             self.wires.acknowledged = true;
             self.wires.report(Cause::Watchdog);
         }
@@ -597,7 +597,7 @@ impl Hil {
         }
         cycle.causes.clear();
         cycle.causes.extend_from_slice(&self.wires.causes);
-        let order = control.cycle(&Told {
+        let order = control.cycle(&CycleInputs {
             ticks,
             late_ns: trace::within_tick(cycle.late_ns, ticks, self.rig.period_ns),
             readings: &cycle.readings,
@@ -607,7 +607,7 @@ impl Hil {
             set: &cycle.set,
         });
         if let Some(number) = self.set.take() {
-            let refused = control.refused_set().map(|status| Answer::Refused(Why::Set(Objection::Model(status))));
+            let refused = control.refused_set().map(|status| Answer::Refused(Reason::Set(Objection::Model(status))));
             self.counts.refused_sets += u64::from(refused.is_some());
             self.commands.answer(number, refused.unwrap_or(Answer::Taken));
         }

@@ -73,7 +73,7 @@ pub fn sent() -> u32 {
 
 /// The signal that requested a stop: SIGINT, SIGTERM or SIGHUP. The cycle then ends the run; a second signal ends the
 /// process.
-pub fn asked() -> Option<i32> {
+pub fn requested_stop() -> Option<i32> {
     Some(ASKED.load(Ordering::Relaxed)).filter(|signal| *signal != 0)
 }
 
@@ -222,7 +222,7 @@ impl Watchdog {
     }
 
     /// Whether the watchdog has acted: must be checked immediately before anything is sent.
-    pub fn has_bitten(&self) -> bool {
+    pub fn has_fired(&self) -> bool {
         self.shared.bitten.load(Ordering::Acquire)
     }
 
@@ -269,7 +269,7 @@ mod tests {
             std::thread::sleep(Duration::from_millis(10));
         }
         assert_eq!(bites.load(Ordering::Relaxed), 0);
-        while !watchdog.has_bitten() {
+        while !watchdog.has_fired() {
             std::thread::sleep(Duration::from_millis(10));
         }
         assert!(!watchdog.beat(), "a late cycle learns of it");

@@ -5,7 +5,7 @@ use super::campaign::quick;
 use super::control;
 use super::cycle::{Hil, Options, look_ahead};
 use super::live::{Judge, Objection, Set};
-use super::operator::{Answer, Command, Operator, PLACES, Stamp, Ticket, Why};
+use super::operator::{Answer, Command, Operator, PLACES, Reason, Stamp, Ticket};
 use super::simulated::{Pace, World};
 use crate::drive::Step;
 use crate::rng::Chance;
@@ -87,7 +87,7 @@ fn each_command_is_answered_once_and_accepted_sets_act() {
                 match stand.operator.say(command) {
                     Ok(ticket) => open.push((ticket, command)),
                     Err(why) => {
-                        assert_eq!(why, Why::Full, "seed {seed}");
+                        assert_eq!(why, Reason::Full, "seed {seed}");
                         assert!(open.len() >= PLACES, "seed {seed}: full with {} under way", open.len());
                         *counts.entry("full").or_default() += 1;
                     }
@@ -111,13 +111,13 @@ fn each_command_is_answered_once_and_accepted_sets_act() {
                         }
                         *counts.entry("taken").or_default() += 1;
                     }
-                    (Answer::Refused(Why::Set(Objection::Broken(..))), Command::Set(_)) => {
+                    (Answer::Refused(Reason::Set(Objection::Broken(..))), Command::Set(_)) => {
                         *counts.entry("broken").or_default() += 1;
                     }
-                    (Answer::Refused(Why::Set(_) | Why::NotNow(_)), Command::Set(_)) => {
+                    (Answer::Refused(Reason::Set(_) | Reason::NotNow(_)), Command::Set(_)) => {
                         *counts.entry("refused").or_default() += 1;
                     }
-                    (Answer::Taken | Answer::Refused(Why::NotNow(_)), _) => *counts.entry("other").or_default() += 1,
+                    (Answer::Taken | Answer::Refused(Reason::NotNow(_)), _) => *counts.entry("other").or_default() += 1,
                     (answer, command) => panic!("seed {seed}: {} gave {answer:?}", command.name()),
                 }
                 false
@@ -179,7 +179,7 @@ fn old_commands_are_refused_except_a_stop() {
     stand.hil.cycle();
     for ticket in [enable, set] {
         let answer = stand.operator.answer(ticket);
-        assert!(matches!(answer, Some(Answer::Refused(Why::Old(ns))) if ns > 1_000 * MS), "{answer:?}");
+        assert!(matches!(answer, Some(Answer::Refused(Reason::Old(ns))) if ns > 1_000 * MS), "{answer:?}");
     }
     assert_eq!(stand.hil.step(), Step::AwaitEnable);
     let fresh = stand.operator.say(Command::Enable).unwrap();
@@ -222,8 +222,8 @@ fn without_a_judge_every_set_is_refused_and_after_the_end_every_command() {
     let ticket = operator.say(Command::Set(Set::new(&[(slot, 0.5)]).unwrap())).unwrap();
     let open = operator.say(Command::Enable).unwrap();
     hil.cycle();
-    assert_eq!(operator.answer(ticket), Some(Answer::Refused(Why::Unjudged)));
+    assert_eq!(operator.answer(ticket), Some(Answer::Refused(Reason::Unjudged)));
     drop(hil);
-    assert_eq!(operator.answer(open), Some(Answer::Refused(Why::Ended)));
-    assert_eq!(operator.say(Command::Arm), Err(Why::Ended));
+    assert_eq!(operator.answer(open), Some(Answer::Refused(Reason::Ended)));
+    assert_eq!(operator.say(Command::Arm), Err(Reason::Ended));
 }

@@ -60,12 +60,12 @@ pub enum Answer {
     /// It takes effect in this cycle.
     Taken,
     /// It has no effect.
-    Refused(Why),
+    Refused(Reason),
 }
 
 /// Reason to refuse a command.
 #[derive(Clone, Copy, PartialEq, Debug)]
-pub enum Why {
+pub enum Reason {
     /// It waited for this time, ns.
     Old(u64),
     /// It is not permitted in this stage.
@@ -82,17 +82,17 @@ pub enum Why {
     Ended,
 }
 
-impl Why {
+impl Reason {
     /// The reason as text; for a set, its judge has a better one.
     pub fn words(&self) -> String {
         match self {
-            Why::Old(ns) => format!("it is {:.1} s old: say it again", *ns as f64 * 1e-9),
-            Why::NotNow(stage) => format!("it has no effect now: the rig is {stage}"),
-            Why::Stopping => "the rig was told to stop".into(),
-            Why::Unjudged => "no parameter of this rig may change while it runs".into(),
-            Why::Set(objection) => format!("{objection:?}"),
-            Why::Full => format!("{PLACES} commands wait already: say it again"),
-            Why::Ended => "the rig has ended".into(),
+            Reason::Old(ns) => format!("it is {:.1} s old: say it again", *ns as f64 * 1e-9),
+            Reason::NotNow(stage) => format!("it has no effect now: the rig is {stage}"),
+            Reason::Stopping => "the rig was told to stop".into(),
+            Reason::Unjudged => "no parameter of this rig may change while it runs".into(),
+            Reason::Set(objection) => format!("{objection:?}"),
+            Reason::Full => format!("{PLACES} commands wait already: say it again"),
+            Reason::Ended => "the rig has ended".into(),
         }
     }
 }
@@ -171,7 +171,7 @@ impl Operator {
     ///
     /// # Errors
     /// If the queue is full or the rig has ended.
-    pub fn say(&mut self, command: Command) -> Result<Ticket, Why> {
+    pub fn say(&mut self, command: Command) -> Result<Ticket, Reason> {
         let stamp = match self.wall {
             true => Stamp::wall(),
             false => Stamp::Rig(self.shared.now_ns.load(Ordering::Relaxed)),
@@ -183,16 +183,16 @@ impl Operator {
     ///
     /// # Errors
     /// As [`Operator::say`].
-    pub fn say_at(&mut self, command: Command, stamp: Stamp) -> Result<Ticket, Why> {
+    pub fn say_at(&mut self, command: Command, stamp: Stamp) -> Result<Ticket, Reason> {
         self.listen();
         let number = self.next;
         if command == Command::Stop {
             self.shared.stop.store(true, Ordering::Relaxed);
             self.remember(number, Answer::Taken);
         } else if self.commands.is_abandoned() {
-            return Err(Why::Ended);
+            return Err(Reason::Ended);
         } else if self.open == PLACES || !self.commands.push(Said { number, stamp, command }) {
-            return Err(Why::Full);
+            return Err(Reason::Full);
         } else {
             self.open += 1;
         }
@@ -212,7 +212,7 @@ impl Operator {
         self.listen();
         match self.known.iter().position(|(number, _)| *number == ticket.0) {
             Some(at) => self.known.remove(at).map(|(_, answer)| answer),
-            None => ended.then_some(Answer::Refused(Why::Ended)),
+            None => ended.then_some(Answer::Refused(Reason::Ended)),
         }
     }
 
@@ -290,7 +290,7 @@ impl Commands {
             if age_ns <= self.old_ns || !is_present(Protection::Old) {
                 return Some(said);
             }
-            self.answer(said.number, Answer::Refused(Why::Old(age_ns)));
+            self.answer(said.number, Answer::Refused(Reason::Old(age_ns)));
         }
         None
     }

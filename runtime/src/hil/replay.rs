@@ -3,7 +3,7 @@
 //! In: the messages of a log, and the rig's programs, compiled again. Out: the number of cycles that agree, or the
 //! first cycle and number that differ. Knows neither bus nor clock.
 
-use super::control::{Control, Told};
+use super::control::{Control, CycleInputs};
 use super::trace::{self, Cycle, Shape};
 use crate::record::log::{LOST, Message};
 use abi::rig::Rig;
@@ -136,7 +136,7 @@ impl<'a> Replay<'a> {
         if recorded.arms {
             self.control.supervisor_mut().arm();
         }
-        let order = self.control.cycle(&Told {
+        let order = self.control.cycle(&CycleInputs {
             ticks: recorded.ticks,
             late_ns: trace::within_tick(recorded.late_ns, recorded.ticks, self.rig.period_ns),
             readings: &recorded.readings,

@@ -156,7 +156,7 @@ impl Bus for Slow {
 /// A cycle as the test observed it: time of its last use of clock or bus, its end, and whether drives were enabled
 /// then.
 #[derive(Clone, Copy)]
-struct Seen {
+struct Measured {
     touched_ns: u64,
     end_ns: u64,
     awake: bool,
@@ -198,7 +198,7 @@ fn run(script: &Script) -> Result<Shown, String> {
     let bitten = bites.clone();
     let bite = move || bitten.lock().unwrap().push(monotonic_ns());
     hil.watched_by(Watchdog::new(Duration::from_nanos(script.watchdog_ns), bite).unwrap());
-    let mut cycles: Vec<Seen> = Vec::new();
+    let mut cycles: Vec<Measured> = Vec::new();
     let (mut cause, mut asked_ns) = (None, u64::MAX);
     while hil.ended().is_none() {
         let mut now = plan.borrow_mut();
@@ -207,7 +207,7 @@ fn run(script: &Script) -> Result<Shown, String> {
         hil.cycle();
         let (end_ns, touched_ns) = (monotonic_ns(), plan.borrow().touched_ns);
         let awake = hil.step() > Step::AwaitEnable && hil.ended().is_none();
-        cycles.push(Seen { touched_ns, end_ns, awake });
+        cycles.push(Measured { touched_ns, end_ns, awake });
         cause = cause.or(hil.control().and_then(|control| control.supervisor().cause()));
         if cycles.len() as u64 == 600 {
             asked_ns = monotonic_ns();
@@ -270,7 +270,7 @@ fn run(script: &Script) -> Result<Shown, String> {
 }
 
 /// Checks that the watchdog never acted early, and only while drives were enabled.
-fn judge_early(bites: &[u64], cycles: &[Seen], script: &Script) -> Result<Shown, String> {
+fn judge_early(bites: &[u64], cycles: &[Measured], script: &Script) -> Result<Shown, String> {
     for bite in bites {
         let last = cycles.iter().rev().find(|cycle| cycle.end_ns <= *bite);
         let awake = last.is_some_and(|cycle| cycle.awake);

@@ -20,7 +20,7 @@ pub struct Bounds {
 }
 
 /// The signal in which a node reports its torque, speed or position.
-pub fn told(rig: &Rig, node: usize, what: What) -> Option<Signal> {
+pub fn measured_signal(rig: &Rig, node: usize, what: What) -> Option<Signal> {
     rig.nodes[node].tells(what).map(|what| Signal { node, what })
 }
 
@@ -28,15 +28,15 @@ pub fn told(rig: &Rig, node: usize, what: What) -> Option<Signal> {
 pub fn answer(rig: &Rig, output: &Output) -> Option<Signal> {
     let Signal { node, what } = output.signal;
     let asked = rig.nodes[node].asks_for(what).filter(|_| rig.nodes[node].moves)?;
-    told(rig, node, asked)
+    measured_signal(rig, node, asked)
 }
 
 /// Checks that drives lack, and why: one line for each such drive.
-pub fn lacking(rig: &Rig) -> Vec<String> {
+pub fn missing_monitors(rig: &Rig) -> Vec<String> {
     let framed = |node: &usize| rig.nodes[*node].moves && matches!(rig.nodes[*node].kind, Kind::Frames(_));
     let line = |node: usize| {
         let within = rig.nodes[node].within;
-        let tells = |what| told(rig, node, what).is_some();
+        let tells = |what| measured_signal(rig, node, what).is_some();
         let commands = || rig.outputs.iter().filter(|output| output.signal.node == node);
         let asks = |output: &Output| rig.nodes[node].asks_for(output.signal.what);
         let torque = commands().any(|output| asks(output) == Some(What::Torque));
@@ -200,7 +200,7 @@ pub fn refusal(rig: &Rig, moving: &[usize], refused: Refused) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::hil::control::{Control, Options, Reading, Source, Told};
+    use crate::hil::control::{Control, CycleInputs, Options, Reading, Source};
     use crate::safety::Cause;
     use crate::testing::rigs;
     use abi::Instance;
@@ -270,7 +270,7 @@ mod tests {
             let values = now(k, control.supervisor().permitted()[0]);
             let readings: Vec<Reading> = places.iter().map(|at| Reading { value: values[*at], age: 0 }).collect();
             let (source, wanted, causes) = (Source::Model, &[][..], &[][..]);
-            control.cycle(&Told { ticks: 1, late_ns: 0, readings: &readings, source, wanted, causes, set: &[] });
+            control.cycle(&CycleInputs { ticks: 1, late_ns: 0, readings: &readings, source, wanted, causes, set: &[] });
             if let Some(cause) = control.supervisor().cause() {
                 return Some((cause, k));
             }
@@ -294,7 +294,7 @@ mod tests {
 
     #[test]
     fn missing_checks_are_reported() {
-        let said = |tells: &[(&str, &str)], within| lacking(&framed(tells, within).0).join("; ");
+        let said = |tells: &[(&str, &str)], within| missing_monitors(&framed(tells, within).0).join("; ");
         assert_eq!(said(&ALL, WITHIN), "drive `load` is not watched for its state (frames have no status word)");
         let power = Within { max_power: None, ..WITHIN };
         assert_eq!(said(&ALL, power), said(&ALL, WITHIN), "greatest torque times greatest speed");
@@ -313,7 +313,7 @@ mod tests {
         // Of two speeds, the one named `speed` is the drive's own.
         assert!(said(&[("a", "rpm"), ("b", "rpm")], WITHIN).contains("speed (it tells no speed)"));
         assert!(!said(&[("a", "rpm"), ("speed", "rpm")], WITHIN).contains("speed (it tells no speed)"));
-        assert_eq!(lacking(&rigs::pair().0), Vec::<String>::new());
+        assert_eq!(missing_monitors(&rigs::pair().0), Vec::<String>::new());
     }
 
     #[test]

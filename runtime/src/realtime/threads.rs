@@ -159,7 +159,7 @@ impl Drop for RealTime {
 
 /// Page faults and preemptions of the calling thread since its start.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
-pub struct Suffered {
+pub struct Interruptions {
     /// Minor and major page faults.
     pub page_faults: u64,
     /// Number of involuntary context switches.
@@ -167,13 +167,13 @@ pub struct Suffered {
 }
 
 /// Page faults and preemptions of the calling thread so far: the difference over a run should be 0.
-pub fn suffered() -> Suffered {
+pub fn interruptions() -> Interruptions {
     // SAFETY: all bytes 0 is a valid rusage.
     let mut usage: libc::rusage = unsafe { std::mem::zeroed() };
     // SAFETY: `usage` is written by the call and outlives it.
     let done = unsafe { libc::getrusage(libc::RUSAGE_THREAD, &mut usage) };
     assert_eq!(done, 0, "every Linux counts for a thread");
-    Suffered { page_faults: (usage.ru_minflt + usage.ru_majflt) as u64, preemptions: usage.ru_nivcsw as u64 }
+    Interruptions { page_faults: (usage.ru_minflt + usage.ru_majflt) as u64, preemptions: usage.ru_nivcsw as u64 }
 }
 
 /// The first core reserved by `isolcpus=`, if this thread may use it.
@@ -277,11 +277,11 @@ mod tests {
 
     #[test]
     fn a_page_fetched_is_counted() {
-        let before = suffered().page_faults;
+        let before = interruptions().page_faults;
         // So much memory never comes from pages that the process has used before.
         let mut fresh = vec![0u8; 64 << 20];
         (0..fresh.len()).step_by(4096).for_each(|at| fresh[at] = 1);
         std::hint::black_box(&fresh);
-        assert!(suffered().page_faults > before, "fresh memory has pages to map");
+        assert!(interruptions().page_faults > before, "fresh memory has pages to map");
     }
 }

@@ -7,7 +7,7 @@
 use super::broken::Broken;
 use super::rigs::{FRAME_COMMAND, Made};
 use super::space::{Ill, MS, Script, What};
-use super::wire::{self, Told, Traffic};
+use super::wire::{self, CycleInputs, Traffic};
 use crate::can::Frame;
 use crate::canopen::Object;
 use crate::drive::state::State;
@@ -122,7 +122,7 @@ pub struct Judge {
     lies: bool,
     /// A fault may cut off our end of a bus for good.
     cut: bool,
-    told: Vec<Told>,
+    told: Vec<CycleInputs>,
     /// Number of successive cycles in which a bus reported lost frames.
     lossy: u32,
 }
@@ -191,7 +191,7 @@ impl Judge {
             blind_ns: None,
             cut: script.faults.iter().any(|fault| cuts(fault.what)),
             lies: script.faults.iter().any(|fault| lies(fault.what)),
-            told: Told::all(rig, &script.rig),
+            told: CycleInputs::all(rig, &script.rig),
             lossy: 0,
         }
     }

@@ -21,7 +21,7 @@ use crate::drive::{self, Step};
 use crate::hil::control::{self, Control};
 use crate::hil::cycle::{Command, End, Hil, Operator, Options};
 use crate::hil::live::{self, Set};
-use crate::hil::operator::{Answer, Stamp, Ticket, Why};
+use crate::hil::operator::{Answer, Reason, Stamp, Ticket};
 use crate::hil::replay::Replay;
 use crate::hil::simulated::{BENCH, MASTER, Pace, World};
 use crate::hil::trace;
@@ -476,7 +476,7 @@ impl<'a> Run<'a> {
                 (Some(Answer::Taken), None) => {
                     return Err(self.broken(Broken::Set, "a set was taken that is torn, or from long ago"));
                 }
-                (Some(Answer::Refused(why)), Some(_)) if !stops && why != Why::Stopping => {
+                (Some(Answer::Refused(why)), Some(_)) if !stops && why != Reason::Stopping => {
                     return Err(self.broken(Broken::Set, format!("a set that fits was refused: {why:?}")));
                 }
                 (Some(Answer::Refused(_)), _) => {}

@@ -8,7 +8,7 @@ use super::broken::Broken;
 use super::rigs::{FRAME_ANSWER, INERTIA, Made};
 use crate::can::sim::Port;
 use crate::can::{Bus, Event, Frame, Health, Received, Refused};
-use crate::safety::Seen;
+use crate::safety::Measured;
 use abi::rig::{Kind, Mode, Node, Rig};
 use std::cell::RefCell;
 use std::rc::Rc;
@@ -181,7 +181,7 @@ struct Apart {
 }
 
 /// Readings of one drive.
-pub struct Told {
+pub struct CycleInputs {
     node: usize,
     bus: usize,
     /// Its node id; none: described by frames.
@@ -205,13 +205,13 @@ pub struct Told {
     strays: u32,
 }
 
-impl Told {
+impl CycleInputs {
     /// The drives of a rig before the first cycle.
-    pub fn all(rig: &Rig, made: &Made) -> Vec<Told> {
+    pub fn all(rig: &Rig, made: &Made) -> Vec<CycleInputs> {
         let period = rig.period_ns as f64 * 1e-9;
         let acceleration = made.most * rig.nodes.len() as f64 / INERTIA;
         let told = |(node, at): (usize, &Node)| {
-            let mut told = Told {
+            let mut told = CycleInputs {
                 node,
                 bus: at.bus,
                 id: None,
@@ -281,7 +281,7 @@ impl Told {
     pub fn judge(
         &mut self,
         first: bool,
-        seen: Seen,
+        seen: Measured,
         time: (u32, f64),
         (stops, quick): (bool, bool),
     ) -> Result<(), (Broken, String)> {
