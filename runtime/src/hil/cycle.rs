@@ -14,10 +14,11 @@ use super::live::{Judge, Objection};
 use super::operator::{self, Answer, Commands, Reason};
 pub use super::operator::{Command, Operator};
 use super::stage::{Stage, StageGauge};
-use super::trace::{self, Passed, Shape};
+use super::trace::{self, Shape};
 use super::watches::Bounds;
+use super::wires::Wires;
 use super::{control, emergency, watches};
-use crate::can::{Bus, Event, Frame, Received};
+use crate::can::Bus;
 use crate::coupling::predictor::Wired;
 use crate::drive::{self, Fieldbus, Request, Step, Trouble, TroubleKind, timing};
 use crate::realtime::clock::Clock;
@@ -29,14 +30,10 @@ use std::io;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-/// Most frames that are taken from one bus at a time.
-const MOST_FRAMES: usize = 64;
 /// Number of successive cycles with lost frames after which set-points count as at risk.
 const OVERLOAD: u32 = 3;
 /// Number of cycles between two state messages in the log.
 const STATE_EVERY: u64 = 1000;
-/// Most causes that can occur in one cycle, besides those of buses and nodes.
-const CAUSES: usize = 40;
 /// Longest time that drives may take to lose their torque after the command to do so, ns.
 const REST_NS: u64 = 1_000_000_000;
 
@@ -101,86 +98,6 @@ pub struct Gauges {
     pub log_free: AtomicU64,
     /// Permitted outputs, then recorded quantities: SI, as bits of an `f64`.
     pub values: Vec<AtomicU64>,
-}
-
-/// The buses, with the record of their events in this cycle.
-struct Wires {
-    clock: Box<dyn Clock>,
-    buses: Vec<Box<dyn Bus>>,
-    watchdog: Option<emergency::Watchdog>,
-    /// The cycle has noticed that the watchdog stopped the drives, and sends nothing but stops.
-    acknowledged: bool,
-    /// The frames of this cycle, encoded as words.
-    frames: Vec<u64>,
-    /// Causes reported since the last computation; a frame that a bus refuses later counts in the next cycle.
-    causes: Vec<Cause>,
-    lossy: bool,
-    lost: u64,
-    refused: u64,
-    errors: u64,
-}
-
-impl Wires {
-    /// Sends a frame. After the watchdog has stopped the drives, nothing is sent until the cycle stops them too.
-    fn send(&mut self, bus: usize, frame: Frame) {
-        let bitten = self.watchdog.as_ref().is_some_and(emergency::Watchdog::has_fired);
-        if bitten && !self.acknowledged && is_present(Protection::Hushed) {
-            return;
-        }
-        match self.buses[bus].send(frame) {
-            Ok(()) => self.pass(bus, true, frame, self.clock.now_ns()),
-            Err(_) => {
-                self.refused += 1;
-                self.report(Cause::Bus(bus));
-            }
-        }
-    }
-
-    fn pass(&mut self, bus: usize, sent: bool, frame: Frame, stamp_ns: u64) {
-        if self.frames.len() + 3 <= self.frames.capacity() {
-            Passed { stamp_ns, bus: bus as u8, sent, frame }.write(&mut self.frames);
-        }
-    }
-
-    fn report(&mut self, cause: Cause) {
-        if self.causes.len() < self.causes.capacity() && !self.causes.contains(&cause) {
-            self.causes.push(cause);
-        }
-    }
-
-    /// Reads the received frames and events: at most [`MOST_FRAMES`] from each bus.
-    fn drain(&mut self, fieldbus: &mut Fieldbus) {
-        for bus in 0..self.buses.len() {
-            for n in 0.. {
-                if n == MOST_FRAMES {
-                    self.lossy = true;
-                    break;
-                }
-                match self.buses[bus].receive() {
-                    None => break,
-                    Some(Received::Frame(frame, stamp_ns)) => {
-                        self.pass(bus, false, frame, stamp_ns);
-                        fieldbus.receive(bus, &frame, stamp_ns, &mut |bus, frame| self.send(bus, frame));
-                    }
-                    Some(Received::Event(event, _)) => self.event(bus, event),
-                }
-            }
-        }
-    }
-
-    fn event(&mut self, bus: usize, event: Event) {
-        match event {
-            Event::Warning | Event::Passive | Event::Error | Event::Restarted => self.errors += 1,
-            Event::BusOff | Event::NotAcknowledged | Event::Down => {
-                self.errors += 1;
-                self.report(Cause::Bus(bus));
-            }
-            Event::Lost(frames) => {
-                self.lost += u64::from(frames);
-                self.lossy = true;
-            }
-        }
-    }
 }
 
 /// A running rig.
@@ -256,20 +173,7 @@ impl Hil {
             rig: rig.clone(),
             left: options.duration_ns.map(|ns| ns.div_ceil(rig.period_ns)),
             options,
-            wires: Wires {
-                clock,
-                buses,
-                watchdog: None,
-                acknowledged: false,
-                frames: Vec::with_capacity(1 << 14),
-                // Room for each bus, two for each node, as many foreign frames as the fieldbus can report, and a few
-                // more.
-                causes: Vec::with_capacity(CAUSES + rig.buses.len() + 2 * rig.nodes.len()),
-                lossy: false,
-                lost: 0,
-                refused: 0,
-                errors: 0,
-            },
+            wires: Wires::new(rig, clock, buses),
             fieldbus,
             model,
             control: None,

@@ -12,6 +12,7 @@ pub mod live;
 pub mod trace;
 pub mod replay;
 pub mod emergency;
+mod wires;
 pub mod counts;
 pub mod words;
 pub mod stage;
