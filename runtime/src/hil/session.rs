@@ -83,7 +83,7 @@ pub fn buses(rig: &Rig, time: &Simulation) -> Result<Vec<Box<dyn Bus>>, String> 
         let address = bus.address.parse::<Address>().map_err(|why| why.to_string());
         address
             .and_then(|address| can::open(&address, &options, time, MASTER).map_err(|why| why.to_string()))
-            .map_err(|why| format!("bus `{}`: {why}; --bus {}=ADDRESS selects another one", bus.name, bus.name))
+            .map_err(|why| format!("bus `{}`: {why}\n  --bus {}=ADDRESS selects another one", bus.name, bus.name))
     };
     rig.buses.iter().map(open).collect()
 }
