@@ -29,7 +29,10 @@ impl Outcome {
     }
 }
 
-const RULES: [(&str, fn() -> Outcome); 8] = [
+/// What a rule says, and its check.
+type Rule = (&'static str, fn() -> Outcome);
+
+const RULES: [Rule; 8] = [
     ("the changelog has its headings by kind", changelog),
     ("commits are named by what they do", commits),
     ("no test is ignored", ignored),
