@@ -2,6 +2,9 @@
 //! another thread beside it: experiments of the library by every method, and random texts, each with functions that are
 //! compiled after a random number of calls, or never.
 //!
+//! Mutants tried by hand, each fails with seed 2: a call that the interpreter began starts over once there is code; its
+//! rest is dropped.
+//!
 //! `FRIC_SEED`, `FRIC_RUNS` (default 120 runs).
 
 #[allow(dead_code, reason = "the agreement of back ends uses all of it")]
@@ -39,9 +42,22 @@ fn run(variant: &Variant, policy: Policy) -> (Vec<u64>, String) {
     let mut watch = |_| Continue::Continue(());
     let (instance, ended) = runtime::engine::run_on(instance, &variant.experiment, &mut |_| (), &mut watch);
     let ended = ended.map(|outcome| (outcome.verdicts, outcome.work.steps)).map_err(|failure| failure.to_string());
-    // All NaN count as one value.
-    let bits = |x: &f64| if x.is_nan() { f64::NAN.to_bits() } else { x.to_bits() };
     (instance.block().iter().map(bits).collect(), format!("{ended:?}"))
+}
+
+/// The status of each of several calls for so many steps, and the block after it.
+fn advanced(variant: &Variant, policy: Policy, calls: &[u64]) -> Vec<(u64, Vec<u64>)> {
+    let (program, solver) = (&variant.program, variant.experiment.solver);
+    let code = tiered(program, solver.method, policy);
+    let mut instance = Instance::new(Arc::new(program.description.clone()), code, &program.params);
+    instance.start(solver.step);
+    let mut call = |count: &u64| (instance.advance(*count), instance.block().iter().map(bits).collect());
+    calls.iter().map(&mut call).collect()
+}
+
+/// All NaN count as one value.
+fn bits(x: &f64) -> u64 {
+    if x.is_nan() { f64::NAN.to_bits() } else { x.to_bits() }
 }
 
 /// Functions that are compiled after a random number of runs, most often within the run.
@@ -52,7 +68,8 @@ fn policy(random: &mut Random) -> Policy {
         2 => Some(random.below(100) as u64),
         _ => Some(random.below(1000) as u64),
     });
-    Policy { compiled_after, in_background: random.below(2) == 0 }
+    let runs_between_looks = 1 + random.below(8) as u64;
+    Policy { compiled_after, runs_between_looks, in_background: random.below(2) == 0 }
 }
 
 #[test]
@@ -81,8 +98,9 @@ fn the_bits_of_a_run_do_not_depend_on_when_its_functions_are_compiled() {
         let changes = Changes { method: Some(method), step, duration: Some(0.5), ..Changes::default() };
         let Some(mut variant) = variant(&name, &text, &experiment, changes) else { continue };
         if random.below(2) == 0 {
-            // Without plots many steps are one call.
+            // Then many steps are one call.
             variant.experiment.plots.clear();
+            variant.experiment.expects.clear();
         }
         let expected = run(&variant, Policy::NEVER);
         let policy = policy(&mut random);
@@ -90,6 +108,16 @@ fn the_bits_of_a_run_do_not_depend_on_when_its_functions_are_compiled() {
         let found = run(&variant, policy.clone());
         assert_eq!(found, expected, "FRIC_SEED={seed} repeats it: {name}, {experiment}, {}, {policy:?}", method.name());
         runs += 1;
+        if method == Method::Adaptive {
+            continue;
+        }
+        // Many short calls, in one of which the step is compiled.
+        let calls: Vec<u64> = (0..20).map(|_| 1 + random.below(6) as u64).collect();
+        let after = Some(random.below(60) as u64);
+        let mut policy = Policy { runs_between_looks: 1 + random.below(3) as u64, in_background: false, ..policy };
+        policy.compiled_after[Function::Step as usize] = after;
+        let (found, expected) = (advanced(&variant, policy.clone(), &calls), advanced(&variant, Policy::NEVER, &calls));
+        assert_eq!(found, expected, "FRIC_SEED={seed} repeats it: {name}, {experiment}, {calls:?}, {policy:?}");
     }
     let all = seeds.end - seeds.start;
     assert!(all == 1 || 2 * runs >= all && 2 * compiled >= all, "{runs} runs of {all} seeds, {compiled} with code");

@@ -104,7 +104,7 @@ pub fn code(functions: &[(Function, Func)], description: &Description, interpret
     }
     match jit::compile_prepared(functions, layout, pool) {
         Ok((machine, _)) => (Code::Machine(machine), Vec::new()),
-        Err(why) => (interpreted(), vec![format!("runs interpreted, some fifty times slower: {why}")]),
+        Err(why) => (interpreted(), vec![format!("runs interpreted, some twenty times slower: {why}")]),
     }
 }
 
@@ -144,26 +144,27 @@ pub struct Policy {
     /// For each function, in the order of [`Function::ALL`]: the number of runs after which it is compiled; `None`:
     /// never. Attempts at adaptive steps count one by one.
     pub compiled_after: [Option<u64>; Function::ALL.len()],
+    /// Runs of the interpreter within one call, at least 1, before it looks again whether to compile and whether there is
+    /// code.
+    pub runs_between_looks: u64,
     /// Whether a thread of its own compiles, while the interpreter continues; otherwise the next call waits for it.
     pub in_background: bool,
 }
 
 impl Policy {
     /// Everything is interpreted.
-    pub const NEVER: Policy = Policy { compiled_after: [None; Function::ALL.len()], in_background: false };
+    pub const NEVER: Policy =
+        Policy { compiled_after: [None; Function::ALL.len()], runs_between_looks: u64::MAX, in_background: false };
 
-    /// Compiles when the runs so far have taken about half as long as compiling takes: interpreting an operation takes
-    /// some 2 ns, compiling it some 2 µs. An adaptive step takes some 13 ms, because the time of register allocation
-    /// grows faster than the length, and 3.4 µs to interpret.
+    /// Compiles when the runs so far have taken nearly as long as compiling takes: interpreting an operation takes some
+    /// 2 ns, compiling it some 2 µs. An adaptive step takes some 13 ms, because the time of register allocation grows
+    /// faster than the length, and 2.2 µs to interpret.
     pub const USUAL: Policy = {
-        let mut compiled_after = [Some(500); Function::ALL.len()];
-        compiled_after[Function::Rosenbrock as usize] = Some(2000);
-        Policy { compiled_after, in_background: true }
+        let mut compiled_after = [Some(800); Function::ALL.len()];
+        compiled_after[Function::Rosenbrock as usize] = Some(5000);
+        Policy { compiled_after, runs_between_looks: 64, in_background: true }
     };
 }
-
-/// Runs of the interpreter within one call before it looks again whether the code has been compiled.
-const RUNS_BETWEEN_LOOKS: u64 = 64;
 
 /// Code whose functions are compiled one by one.
 struct Tiered(Arc<Functions>);
@@ -220,12 +221,11 @@ impl Functions {
 }
 
 impl Tiered {
-    /// Compiles a function if that pays by now and nobody has begun to; `least`: the least number of runs that follow.
-    fn consider(&self, which: Function, least: u64) {
+    /// Compiles a function if that pays by now and nobody has begun to.
+    fn consider(&self, which: Function) {
         let forms = &self.0.forms[which as usize];
         let Some(after) = self.0.policy.compiled_after[which as usize] else { return };
-        let pays = forms.runs.load(Ordering::Relaxed).saturating_add(least) > after;
-        if !pays || forms.is_claimed.swap(true, Ordering::Relaxed) {
+        if forms.runs.load(Ordering::Relaxed) < after || forms.is_claimed.swap(true, Ordering::Relaxed) {
             return;
         }
         let functions = self.0.clone();
@@ -243,21 +243,20 @@ impl Interpret for Tiered {
         let settled = |block: &[f64]| self.0.settled(which, block);
         let mut left = count;
         loop {
-            // A call for adaptive steps ends at the first step that it leaves open, most often long before `count`.
-            let least = if which == Function::Rosenbrock { 1 } else { left };
             if forms.machine.get().is_none() {
-                self.consider(which, least);
+                self.consider(which);
             }
             // Machine code for a single step may leave the count to the caller, who stores it only after a single step.
             let keeps_count = which != Function::Step || left > 1 || count == 1;
             if let Some(machine) = self.0.machine(which).filter(|_| keeps_count) {
                 return machine.call(which, block, pool, left);
             }
-            let runs = left.min(RUNS_BETWEEN_LOOKS);
+            let runs = left.min(self.0.policy.runs_between_looks);
             let before = settled(block);
             let interpreter = forms.interpreter.get_or_init(|| self.0.make(which, Interpreter::new));
             let status = interpreter.call(which, block, pool, runs);
-            let done = least.min(runs).saturating_add(settled(block).saturating_sub(before));
+            // A call for adaptive steps ends at the first step that it leaves open, most often long before `count`.
+            let done = if which == Function::Rosenbrock { 1 + settled(block).saturating_sub(before) } else { runs };
             forms.runs.fetch_add(done, Ordering::Relaxed);
             left -= runs;
             if status != 0 || left == 0 {
@@ -297,7 +296,7 @@ mod tests {
         built.map_err(|found| format!("{found:?}")).expect("it compiles").program
     }
 
-    const CALLS: u64 = 600;
+    const CALLS: u64 = 900;
 
     /// The block after each of a number of calls.
     fn blocks_after_calls(code: Code, program: &Program) -> Vec<Vec<u64>> {
