@@ -1,6 +1,6 @@
 //! Compile time of a text, from its first character to its first step, by stage, in a warm process; the time to check
-//! and compile the whole library; and how both grow with the size of a program. Medians of processor time over several
-//! rounds; run with `cargo bench --bench compile`.
+//! and compile the whole library; and the cost of many elements in one model. Medians of processor time over several
+//! rounds; run with `cargo bench --bench compile`. How cost grows with size: `cargo bench --bench size`.
 
 mod clock;
 
@@ -38,7 +38,6 @@ fn main() {
     stages();
     library();
     lines();
-    parts();
     elements();
 }
 
@@ -173,37 +172,6 @@ fn lines() {
         })
         .collect();
     println!("checking a text of 1,000 equations: {:.1} ms", median(&mut times));
-}
-
-/// A chain of parts: checked, and prepared for the interpreter, which excludes code generation.
-fn parts() {
-    println!("a chain of so many parts: checked, compiled for `expo` but for its machine code");
-    for n in [10, 100, 1_000, 10_000] {
-        let mut text = String::from(
-            "model P {\n  input  u [1]\n  param  k = 0.5  in > 0\n  state  x [1] = 0\n  dx/dt  = (u - k * x) / 1 s\n\
-             \x20 output y [1] = x\n}\nmodel Chain {\n  part p1 = P(u = 1)\n",
-        );
-        for k in 2..=n {
-            text += &format!("  part p{k} = P(u = p{}.y)\n", k - 1);
-        }
-        text += &format!(
-            "  output y [1] = p{n}.y\n}}\nexperiment e {{\n  run Chain() for 1 s\n  solver expo step 10 ms\n  expect final(y) >= 0\n}}\n"
-        );
-        let rounds = if n < 10_000 { 9 } else { 3 };
-        let (mut checked, mut compiled) = (Vec::new(), Vec::new());
-        for _ in 0..rounds {
-            let begin = processor_time();
-            let mut loaded = load("chain.fric", &text, &project::Disk);
-            assert!(check(&mut loaded, &project::Disk).is_empty());
-            checked.push(1e3 * (processor_time() - begin));
-            let begin = processor_time();
-            let (mut warnings, options) = (Vec::new(), Options { interpret: true, ..Options::default() });
-            let cases = compiler::compile(&mut loaded, &project::Disk, "e", &options, &mut warnings, &mut |_| ());
-            black_box(cases.map_err(|found| found.len()).expect("the chain compiles"));
-            compiled.push(1e3 * (processor_time() - begin));
-        }
-        println!("  {n:>6}  {:9.2} ms  {:9.2} ms", median(&mut checked), median(&mut compiled));
-    }
 }
 
 /// A model of many parallel LuGre elements: time of its machine code and of its steps, per element.
