@@ -6,7 +6,7 @@
 use crate::compile::{self, Ready, StepDerivative};
 use crate::quantity::significant;
 use abi::Slot;
-use abi::rig::{Kind, Mode, Signal, What};
+use abi::rig::{Kind, Mode, Signal, SignalKind};
 use runtime::coupling::loop_stability::{Ahead, CommandDelay, Loop, Shaft, Step};
 use runtime::coupling::predictor::Wired;
 
@@ -54,7 +54,7 @@ pub fn contacts(ready: &Ready) -> Vec<Contact> {
     let signals: Vec<(Slot, Slot, usize)> = rig
         .inputs
         .iter()
-        .filter(|input| input.signal.what == What::Speed)
+        .filter(|input| input.signal.what == SignalKind::Speed)
         .filter_map(|input| Some((input.slot, seen(input.signal)?, input.signal.node)))
         .collect();
     let mut out = Vec::new();
@@ -64,7 +64,7 @@ pub fn contacts(ready: &Ready) -> Vec<Contact> {
         let applied = rig.plant.applied.iter().find(|(signal, _)| *signal == output.signal);
         let Some((_, torque)) = applied.filter(|_| drive.mode == Mode::Torque) else { continue };
         let inputs: Vec<Slot> = signals.iter().map(|(input, ..)| *input).collect();
-        let position = seen(Signal { node: output.signal.node, what: What::Position });
+        let position = seen(Signal { node: output.signal.node, what: SignalKind::Position });
         let outputs: Vec<Slot> = signals.iter().map(|(_, seen, _)| *seen).chain(position).collect();
         let Some((shaft, states)) = compile::linear_of(&ready.plant_program, &[*torque], &outputs) else { continue };
         let derivative = StepDerivative::new(&ready.program, rig.method, &inputs, &[output.slot]);

@@ -7,7 +7,7 @@
 mod heap;
 mod support;
 
-use abi::rig::{Kind, Rig, Signal, What};
+use abi::rig::{Kind, Rig, Signal, SignalKind};
 use compiler::{Changes, Options, Ready};
 use heap::asked;
 use runtime::hil::cycle::{End, Hil, Options as HilOptions};
@@ -116,8 +116,8 @@ fn recorded(ready: Ready, seconds: f64, signals: &[Signal]) -> Vec<(Vec<f64>, Ve
 /// F(v) as the load drive applies it, against LuGre's own: g(v) sgn(v) + σ1 exp(−(v/vd)²) … + σ2 v for slow rotation.
 #[test]
 fn the_characteristic_measured_on_the_rig_is_that_of_the_model() {
-    let torque = Signal { node: 0, what: What::Torque };
-    let speed = Signal { node: 0, what: What::Speed };
+    let torque = Signal { node: 0, what: SignalKind::Torque };
+    let speed = Signal { node: 0, what: SignalKind::Speed };
     let rows = recorded(rig_of("characteristics.fric", "characteristic", &[]), 40.0, &[speed, torque]);
     assert_eq!(rows.len(), 40_000);
     let (mut worst, mut compared) = (0f64, 0);
@@ -710,7 +710,7 @@ fn a_long_run_misses_nothing_and_its_memory_stays_as_it_is() {
 fn signals_of_the_example_are_named_as_in_its_text() {
     let Ready { rig, .. } = ready(&[]);
     let named = |node, what| runtime::hil::words::signal(&rig, Signal { node, what });
-    assert_eq!(named(0, What::Speed), "load.speed");
+    assert_eq!(named(0, SignalKind::Speed), "load.speed");
     assert!(matches!(rig.nodes[2].kind, Kind::Frames(_)));
-    assert_eq!(named(3, What::Field(0, 0)), "panel.enable");
+    assert_eq!(named(3, SignalKind::Field(0, 0)), "panel.enable");
 }

@@ -5,7 +5,7 @@ mod support;
 
 use abi::description::Kind;
 use abi::plan::{Method, Steps};
-use compiler::experiment::vary::{Fitted, Varying};
+use compiler::experiment::vary::{PreparedRun, Varying};
 use compiler::ir::random::Random;
 use compiler::{Case, Changes, Options};
 use runtime::engine::lanes::{self, Next};
@@ -83,7 +83,7 @@ fn in_lanes_and_alone(varying: &Varying, path: &str, values: &[f64]) -> Vec<Resu
             return Next::Later;
         }
         left.next().map_or(Next::Nothing, |k| {
-            let Fitted { instance, experiment } = fitted(k);
+            let PreparedRun { instance, experiment } = fitted(k);
             Next::Run(k, Box::new((instance, experiment)))
         })
     };
@@ -91,7 +91,7 @@ fn in_lanes_and_alone(varying: &Varying, path: &str, values: &[f64]) -> Vec<Resu
     let mut all = Vec::with_capacity(runs);
     for (k, found) in found.into_iter().enumerate() {
         let found = found.unwrap_or_else(|| panic!("run {k} came to nothing"));
-        let Fitted { instance, experiment } = fitted(k);
+        let PreparedRun { instance, experiment } = fitted(k);
         let alone = engine::run(instance, &experiment, &mut go_on);
         assert_eq!(found, alone, "run {k} of `{}`, {path} = {}", varying.label, values[k]);
         all.push(found);

@@ -6,7 +6,7 @@
 mod support;
 
 use abi::description::Slot;
-use abi::live::Place;
+use abi::live::Tunable;
 use compiler::{Changes, NoSources, Options, Ready};
 use runtime::hil::live::{Judge, Objection, TOLD};
 use runtime::rng::Chance;
@@ -226,7 +226,7 @@ fn a_set_is_validated_like_a_start_with_the_same_values() {
         let Ok(ready) = start(&text, &[]) else { continue };
         rigs += 1;
         let named = |live: bool| -> Vec<(String, String)> {
-            let params = ready.live.params.iter().filter(|param| matches!(param.place, Place::Live(..)) == live);
+            let params = ready.live.params.iter().filter(|param| matches!(param.place, Tunable::Live(..)) == live);
             params.map(|param| (param.path.clone(), param.unit.text.clone())).collect()
         };
         let (may, start_only) = (named(true), named(false));
@@ -271,8 +271,8 @@ fn parameters_that_only_a_start_reads_say_why() {
     let ready = (0..100).find_map(|seed| start(&text(&mut Chance(seed)), &[]).ok());
     let ready = ready.unwrap_or_else(|| panic!("{:#?}", start(&text(&mut Chance(0)), &[]).err()));
     let why = |path: &str| match &ready.live.param(path).unwrap_or_else(|| panic!("no {path}")).place {
-        Place::Live(..) => "live".to_string(),
-        Place::Start(why) => why.clone(),
+        Tunable::Live(..) => "live".to_string(),
+        Tunable::Start(why) => why.clone(),
     };
     assert_eq!(why("fr.gain"), "live");
     assert_eq!(why("fr.Ts"), "a period follows from it");

@@ -3,7 +3,7 @@
 mod support;
 
 use abi::Slot;
-use abi::rig::{Kind, Mode, Overrun, Signal, What};
+use abi::rig::{Kind, Mode, Overrun, Signal, SignalKind};
 use compiler::{Options, Ready};
 use std::fs;
 use support::{Texts, root};
@@ -76,11 +76,14 @@ fn the_example_becomes_two_programs_and_a_plan() {
     );
 
     // The part alone: the torques that drives apply move the shaft that encoders measure.
-    let of = |node: usize, what: What| Signal { node, what };
+    let of = |node: usize, what: SignalKind| Signal { node, what };
     let applied: Vec<Signal> = rig.plant.applied.iter().map(|(signal, _)| *signal).collect();
-    assert_eq!(applied, [of(1, What::Torque), of(0, What::Torque)]);
+    assert_eq!(applied, [of(1, SignalKind::Torque), of(0, SignalKind::Torque)]);
     let seen: Vec<Signal> = rig.plant.seen.iter().map(|(signal, _)| *signal).collect();
-    assert_eq!(seen, [of(0, What::Speed), of(1, What::Position), of(1, What::Speed), of(0, What::Position)]);
+    assert_eq!(
+        seen,
+        [of(0, SignalKind::Speed), of(1, SignalKind::Position), of(1, SignalKind::Speed), of(0, SignalKind::Position)]
+    );
     assert!((rig.plant.inertia.unwrap() - 0.012).abs() < 1e-12, "{:?}", rig.plant.inertia);
     let mut plant = plant;
     assert_eq!(plant.start(20e-6), 0);
@@ -110,7 +113,7 @@ fn the_derivative_of_a_step_at_rest_is_that_of_its_formulas() {
     let mut loaded = compiler::load("stick_slip.fric", &text, &sources);
     let made = compiler::rig(&mut loaded, &sources, "plain", &compiler::Options::default(), &mut Vec::new());
     let made = made.unwrap_or_else(|errors| panic!("{errors:?}"));
-    let speed = made.rig.inputs.iter().find(|input| input.signal.what == abi::rig::What::Speed).unwrap();
+    let speed = made.rig.inputs.iter().find(|input| input.signal.what == abi::rig::SignalKind::Speed).unwrap();
     let load = made.rig.outputs.iter().find(|output| output.signal.node == 0).unwrap();
     let derivative = compiler::rig::StepDerivative::new(&made.program, made.rig.method, &[speed.slot], &[load.slot]);
     let mut control = made.control.clone();

@@ -6,7 +6,9 @@
 
 use crate::description::{Description, Segment, Slot};
 use crate::foreign::{is_name, is_text};
-use crate::rig::{Cia402, Field, Format, Input, Kind, Message, Mode, Node, Output, Overrun, Rig, Signal, What, Within};
+use crate::rig::{
+    Cia402, DriveLimits, Field, Format, Input, Kind, Message, Mode, Node, Output, Overrun, Rig, Signal, SignalKind,
+};
 use crate::series::Method;
 use crate::unit::Unit;
 
@@ -103,7 +105,7 @@ impl Rig {
         let longest = (DELAY.0 * self.period_ns as f64 * 1e-9 * (1.0 + 1e-9)).min(DELAY.1);
         ensure((0.0..=longest).contains(&node.delay), || format!("a dead time of {} s", node.delay))?;
         ensure((0.0..=DELAY.1).contains(&node.lag), || format!("a lag of {} s", node.lag))?;
-        let Within { max_speed, travel, max_power } = node.within;
+        let DriveLimits { max_speed, travel, max_power } = node.within;
         for (what, value) in [("greatest speed", max_speed), ("greatest power", max_power)] {
             ensure(value.is_none_or(positive), || format!("its {what} is {value:?}"))?;
         }
@@ -133,9 +135,9 @@ impl Rig {
             return Err(format!("a signal of node {node} of {}", self.nodes.len()));
         };
         match (&found.kind, what) {
-            (Kind::Cia402(_), What::Field(..)) => Err(format!("drive `{}` has no fields", found.name)),
+            (Kind::Cia402(_), SignalKind::Field(..)) => Err(format!("drive `{}` has no fields", found.name)),
             (Kind::Cia402(_), _) => Ok(None),
-            (Kind::Frames(messages), What::Field(message, field)) => {
+            (Kind::Frames(messages), SignalKind::Field(message, field)) => {
                 let found_field = messages.get(message).and_then(|all| Some((all, all.fields.get(field)?)));
                 found_field.map(Some).ok_or_else(|| format!("`{}` has no message {message}, field {field}", found.name))
             }
@@ -156,7 +158,9 @@ impl Rig {
         if let Kind::Cia402(drive) = &node.kind {
             let follows = matches!(
                 (drive.mode, signal.what),
-                (Mode::Torque, What::Torque) | (Mode::Speed, What::Speed) | (Mode::Position, What::Position)
+                (Mode::Torque, SignalKind::Torque)
+                    | (Mode::Speed, SignalKind::Speed)
+                    | (Mode::Position, SignalKind::Position)
             );
             ensure(follows && node.moves, || format!("`{}` does not follow {:?}", node.name, signal.what))?;
         }
@@ -180,7 +184,7 @@ impl Rig {
             unit_fits(&series.unit)?;
         }
         let Some(at) = self.predict else { return Ok(()) };
-        let gives = self.outputs.iter().any(|output| output.signal == Signal { node: at, what: What::Torque });
+        let gives = self.outputs.iter().any(|output| output.signal == Signal { node: at, what: SignalKind::Torque });
         ensure(gives, || format!("node {at} is to be predicted and gives no torque"))
     }
 
@@ -368,7 +372,7 @@ mod tests {
             delay: 1e-3,
             lag: 0.0,
             timeout_ns: u64::MAX,
-            within: Within::default(),
+            within: DriveLimits::default(),
         };
         let signal = |node, what| Signal { node, what };
         let bus = |name: &str| Bus { name: name.into(), address: "sim:bench".into(), bit_rate: 1_000_000 };
@@ -380,8 +384,11 @@ mod tests {
             steps: 1,
             buses: vec![bus("can0"), bus("can1")],
             nodes: vec![node("load", 0, Kind::Cia402(drive)), node("panel", 1, Kind::Frames(messages))],
-            inputs: vec![Input { signal: signal(1, What::Field(0, 1)), slot: Slot(4), start: 0.0, needed: true }],
-            outputs: vec![output(signal(0, What::Torque), Slot(5)), output(signal(1, What::Field(1, 0)), Slot(6))],
+            inputs: vec![Input { signal: signal(1, SignalKind::Field(0, 1)), slot: Slot(4), start: 0.0, needed: true }],
+            outputs: vec![
+                output(signal(0, SignalKind::Torque), Slot(5)),
+                output(signal(1, SignalKind::Field(1, 0)), Slot(6)),
+            ],
             watchdog_ns: 5_000_000,
             overrun: Overrun::Hold(2),
             stops: vec![Stop { slot: Slot(6), condition: "v > 1".into(), why: "too fast".into() }],
@@ -389,8 +396,8 @@ mod tests {
             predict: Some(0),
             needs_look: false,
             plant: Plant {
-                applied: vec![(signal(0, What::Torque), Slot(3))],
-                seen: vec![(signal(0, What::Speed), Slot(5))],
+                applied: vec![(signal(0, SignalKind::Torque), Slot(3))],
+                seen: vec![(signal(0, SignalKind::Speed), Slot(5))],
                 inertia: Some(0.012),
             },
         };
@@ -452,10 +459,10 @@ mod tests {
             ("is switched by", |rig| message(rig).fields[0].multiplexed = Some((2, 0))),
             ("in SI", |rig| message(rig).fields[0].unit.scale = f64::NAN),
             ("is no input", |rig| rig.inputs[0].slot = Slot(5)),
-            ("has no message", |rig| rig.inputs[0].signal.what = What::Field(0, 2)),
+            ("has no message", |rig| rig.inputs[0].signal.what = SignalKind::Field(0, 2)),
             ("signal of node 7", |rig| rig.inputs[0].signal.node = 7),
-            ("does not follow", |rig| rig.outputs[0].signal.what = What::Speed),
-            ("do not send", |rig| rig.outputs[1].signal.what = What::Field(0, 0)),
+            ("does not follow", |rig| rig.outputs[0].signal.what = SignalKind::Speed),
+            ("do not send", |rig| rig.outputs[1].signal.what = SignalKind::Field(0, 0)),
             ("slot 7 of a block of 7", |rig| rig.outputs[0].slot = Slot(7)),
             ("safe value", |rig| rig.outputs[0].safe = 2.0),
             ("its limits are", |rig| rig.outputs[0].slew = f64::NAN),

@@ -30,12 +30,12 @@ pub struct Param {
     /// Whether it is a Boolean.
     pub boolean: bool,
     /// Whether it may change while the rig runs.
-    pub place: Place,
+    pub place: Tunable,
 }
 
 /// Whether a parameter may change while the rig runs.
 #[derive(Clone, PartialEq, Debug)]
-pub enum Place {
+pub enum Tunable {
     /// Yes: its slot in the control program and its slot in the judge.
     Live(Slot, Slot),
     /// No, only a start reads it. The reason, as a clause such as "a period follows from it".
@@ -174,7 +174,7 @@ fn bound(declared: &Option<(Slot, bool)>, number: f64) -> Option<(f64, bool)> {
 
 /// The bound of a range that a value violates.
 #[derive(Clone, Copy, PartialEq, Debug)]
-pub struct Beyond {
+pub struct ViolatedBound {
     /// `above`, `at least`, `below`, `at most`.
     pub word: &'static str,
     /// The bound, SI.
@@ -182,7 +182,7 @@ pub struct Beyond {
 }
 
 /// The bound that a value violates. Each bound comes with whether it is excluded.
-pub fn beyond(value: f64, low: Option<(f64, bool)>, high: Option<(f64, bool)>) -> Option<Beyond> {
+pub fn beyond(value: f64, low: Option<(f64, bool)>, high: Option<(f64, bool)>) -> Option<ViolatedBound> {
     let below = low.filter(|(bound, strict)| value < least(*bound, *strict));
     let above = high.filter(|(bound, strict)| value > greatest(*bound, *strict));
     // A bound that excludes 0 also excludes everything below TINY.
@@ -191,8 +191,8 @@ pub fn beyond(value: f64, low: Option<(f64, bool)>, high: Option<(f64, bool)>) -
         if strict && bound == 0.0 && tiny { (TINY.copysign(value), strict) } else { (bound, strict) }
     };
     match (below.map(named), above.map(named)) {
-        (Some((bound, strict)), _) => Some(Beyond { word: if strict { "above" } else { "at least" }, bound }),
-        (None, Some((bound, strict))) => Some(Beyond { word: if strict { "below" } else { "at most" }, bound }),
+        (Some((bound, strict)), _) => Some(ViolatedBound { word: if strict { "above" } else { "at least" }, bound }),
+        (None, Some((bound, strict))) => Some(ViolatedBound { word: if strict { "below" } else { "at most" }, bound }),
         (None, None) => None,
     }
 }
@@ -217,7 +217,7 @@ pub fn is_empty(low: Option<(f64, bool)>, high: Option<(f64, bool)>) -> bool {
 }
 
 /// E0502: the message for a value outside of its range.
-pub fn beyond_words(name: &str, model: &str, unit: &Unit, value: f64, beyond: Beyond) -> String {
+pub fn beyond_words(name: &str, model: &str, unit: &Unit, value: f64, beyond: ViolatedBound) -> String {
     let (bound, value) = (quantity(beyond.bound, unit, 3), quantity(value, unit, 3));
     format!("`{name}` of {model} must be {} {bound}, not {value}", beyond.word)
 }
@@ -265,8 +265,8 @@ impl Live {
     /// Both slots of each parameter that may change: control program, judge.
     pub fn places(&self) -> impl Iterator<Item = (Slot, Slot)> {
         self.params.iter().filter_map(|param| match &param.place {
-            Place::Live(control, judge) => Some((*control, *judge)),
-            Place::Start(_) => None,
+            Tunable::Live(control, judge) => Some((*control, *judge)),
+            Tunable::Start(_) => None,
         })
     }
 
@@ -287,24 +287,24 @@ encode_structs! {
     Param { path, unit, boolean, place }
 }
 
-impl Encode for Place {
+impl Encode for Tunable {
     fn encode(&self, out: &mut Vec<u8>) {
         match self {
-            Place::Live(control, judge) => {
+            Tunable::Live(control, judge) => {
                 out.push(0);
                 (*control, *judge).encode(out);
             }
-            Place::Start(why) => {
+            Tunable::Start(why) => {
                 out.push(1);
                 why.encode(out);
             }
         }
     }
 
-    fn decode(reader: &mut Reader) -> Result<Place, Malformed> {
+    fn decode(reader: &mut Reader) -> Result<Tunable, Malformed> {
         match u8::decode(reader)? {
-            0 => <(Slot, Slot)>::decode(reader).map(|(control, judge)| Place::Live(control, judge)),
-            1 => String::decode(reader).map(Place::Start),
+            0 => <(Slot, Slot)>::decode(reader).map(|(control, judge)| Tunable::Live(control, judge)),
+            1 => String::decode(reader).map(Tunable::Start),
             other => Err(Malformed(format!("{other} is no place of a parameter"))),
         }
     }
@@ -381,8 +381,8 @@ mod tests {
         let param = |path: &str, place| Param { path: path.into(), unit: unit.clone(), boolean: false, place };
         Live {
             params: vec![
-                param("fr.Fc", Place::Live(Slot(4), Slot(3))),
-                param("Ts", Place::Start("a period follows from it".into())),
+                param("fr.Fc", Tunable::Live(Slot(4), Slot(3))),
+                param("Ts", Tunable::Start("a period follows from it".into())),
             ],
             checks: vec![
                 Check::Range {

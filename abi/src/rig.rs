@@ -85,12 +85,12 @@ pub struct Node {
     /// Age at which one of its signals counts as lost; 0 if the rig specifies none.
     pub timeout_ns: u64,
     /// Its limits, for a drive described by frames.
-    pub within: Within,
+    pub within: DriveLimits,
 }
 
 /// Limits of a drive described by frames, SI. A drive with a profile has arguments of its own.
 #[derive(Clone, Copy, PartialEq, Debug, Default)]
-pub struct Within {
+pub struct DriveLimits {
     /// Largest speed, rad/s.
     pub max_speed: Option<f64>,
     /// Permitted positions, rad, as the drive reports them.
@@ -102,17 +102,17 @@ pub struct Within {
 impl Node {
     /// The signal with which the node reports its torque, speed or position. For a drive described by frames: the field
     /// with that name, otherwise the only field with a suitable unit.
-    pub fn tells(&self, what: What) -> Option<What> {
+    pub fn tells(&self, what: SignalKind) -> Option<SignalKind> {
         let Kind::Frames(messages) = &self.kind else { return Some(what) };
         let (name, dimension) = match what {
-            What::Torque => ("torque", Dimension::of([1, 2, -2, 0, 0])),
-            What::Speed => ("speed", Dimension::of([0, 0, -1, 0, 0])),
-            What::Position => ("position", Dimension::NONE),
-            What::Enabled | What::Fault | What::Limited | What::Field(..) => return None,
+            SignalKind::Torque => ("torque", Dimension::of([1, 2, -2, 0, 0])),
+            SignalKind::Speed => ("speed", Dimension::of([0, 0, -1, 0, 0])),
+            SignalKind::Position => ("position", Dimension::NONE),
+            SignalKind::Enabled | SignalKind::Fault | SignalKind::Limited | SignalKind::Field(..) => return None,
         };
         let fits = |field: &Field| {
             let unit = &field.unit;
-            unit.dimension == dimension && (what == What::Torque || unit.angle == Angle::Angle)
+            unit.dimension == dimension && (what == SignalKind::Torque || unit.angle == Angle::Angle)
         };
         let mut all = messages.iter().enumerate().filter(|(_, message)| !message.send).flat_map(|(m, message)| {
             message.fields.iter().enumerate().filter(|(_, field)| fits(field)).map(move |(f, field)| (m, f, field))
@@ -120,25 +120,25 @@ impl Node {
         let first = all.next()?;
         let found = std::iter::once(first).chain(all).collect::<Vec<_>>();
         let named = found.iter().find(|(_, _, field)| field.name == name);
-        named.or(found.first().filter(|_| found.len() == 1)).map(|(m, f, _)| What::Field(*m, *f))
+        named.or(found.first().filter(|_| found.len() == 1)).map(|(m, f, _)| SignalKind::Field(*m, *f))
     }
 
     /// The quantity that a command to this signal controls: torque, speed or position of a drive; `None` for anything
     /// else.
-    pub fn asks_for(&self, what: What) -> Option<What> {
+    pub fn asks_for(&self, what: SignalKind) -> Option<SignalKind> {
         match (&self.kind, what) {
             (Kind::Cia402(drive), _) => Some(match drive.mode {
-                Mode::Torque => What::Torque,
-                Mode::Speed => What::Speed,
-                Mode::Position => What::Position,
+                Mode::Torque => SignalKind::Torque,
+                Mode::Speed => SignalKind::Speed,
+                Mode::Position => SignalKind::Position,
             }),
-            (Kind::Frames(messages), What::Field(message, field)) => {
+            (Kind::Frames(messages), SignalKind::Field(message, field)) => {
                 let unit = &messages[message].fields[field].unit;
                 let angle = unit.angle == Angle::Angle;
                 match unit.dimension {
-                    torque if torque == Dimension::of([1, 2, -2, 0, 0]) => Some(What::Torque),
-                    speed if angle && speed == Dimension::of([0, 0, -1, 0, 0]) => Some(What::Speed),
-                    none if angle && none.is_none() => Some(What::Position),
+                    torque if torque == Dimension::of([1, 2, -2, 0, 0]) => Some(SignalKind::Torque),
+                    speed if angle && speed == Dimension::of([0, 0, -1, 0, 0]) => Some(SignalKind::Speed),
+                    none if angle && none.is_none() => Some(SignalKind::Position),
                     _ => None,
                 }
             }
@@ -148,11 +148,11 @@ impl Node {
 
     /// Whether a nonzero command to this signal moves the node: torque, speed or position of a drive with a profile;
     /// for a drive described by frames, a field with the dimension of a force, torque, speed, acceleration or current.
-    pub fn is_moved_by(&self, what: What) -> bool {
+    pub fn is_moved_by(&self, what: SignalKind) -> bool {
         self.moves
             && match (&self.kind, what) {
                 (Kind::Cia402(_), _) => true,
-                (Kind::Frames(messages), What::Field(message, field)) => {
+                (Kind::Frames(messages), SignalKind::Field(message, field)) => {
                     messages[message].fields[field].unit.dimension.moves()
                 }
                 (Kind::Frames(_), _) => false,
@@ -211,12 +211,12 @@ pub struct Signal {
     /// Index into [`Rig::nodes`].
     pub node: usize,
     /// The signal within the node.
-    pub what: What,
+    pub what: SignalKind,
 }
 
 /// A signal within a node.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Debug)]
-pub enum What {
+pub enum SignalKind {
     /// Torque of a CiA 402 drive, N·m.
     Torque,
     /// Speed of a CiA 402 drive, rad/s.

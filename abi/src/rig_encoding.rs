@@ -3,8 +3,8 @@
 use crate::encode::{Encode, Malformed, Reader};
 use crate::plan::{Method, Series};
 use crate::rig::{
-    Bus, Cia402, Field, Format, Input, Kind, Message, Mode, Node, Output, Overrun, Plant, Rig, Signal, Stop, What,
-    Within,
+    Bus, Cia402, DriveLimits, Field, Format, Input, Kind, Message, Mode, Node, Output, Overrun, Plant, Rig, Signal,
+    SignalKind, Stop,
 };
 use crate::{encode_enums, encode_structs};
 
@@ -21,7 +21,7 @@ encode_structs! {
     }
     Bus { name, address, bit_rate }
     Node { name, bus, kind, moves, delay, lag, timeout_ns, within }
-    Within { max_speed, travel, max_power }
+    DriveLimits { max_speed, travel, max_power }
     Cia402 {
         node, rated_torque, mode, count, speed_unit, max_torque, max_speed, travel, max_power, at_sync, profile,
     }
@@ -84,33 +84,33 @@ impl Encode for Kind {
     }
 }
 
-impl Encode for What {
+impl Encode for SignalKind {
     fn encode(&self, out: &mut Vec<u8>) {
         match self {
-            What::Torque => out.push(0),
-            What::Speed => out.push(1),
-            What::Position => out.push(2),
-            What::Enabled => out.push(3),
-            What::Fault => out.push(4),
-            What::Limited => out.push(5),
-            What::Field(message, field) => {
+            SignalKind::Torque => out.push(0),
+            SignalKind::Speed => out.push(1),
+            SignalKind::Position => out.push(2),
+            SignalKind::Enabled => out.push(3),
+            SignalKind::Fault => out.push(4),
+            SignalKind::Limited => out.push(5),
+            SignalKind::Field(message, field) => {
                 out.push(6);
                 (*message, *field).encode(out);
             }
         }
     }
 
-    fn decode(reader: &mut Reader) -> Result<What, Malformed> {
+    fn decode(reader: &mut Reader) -> Result<SignalKind, Malformed> {
         Ok(match u8::decode(reader)? {
-            0 => What::Torque,
-            1 => What::Speed,
-            2 => What::Position,
-            3 => What::Enabled,
-            4 => What::Fault,
-            5 => What::Limited,
+            0 => SignalKind::Torque,
+            1 => SignalKind::Speed,
+            2 => SignalKind::Position,
+            3 => SignalKind::Enabled,
+            4 => SignalKind::Fault,
+            5 => SignalKind::Limited,
             6 => {
                 let (message, field) = <(usize, usize)>::decode(reader)?;
-                What::Field(message, field)
+                SignalKind::Field(message, field)
             }
             other => return Err(Malformed(format!("{other} is no signal"))),
         })
@@ -166,7 +166,7 @@ mod tests {
             delay: 1e-3,
             lag: 0.0,
             timeout_ns: 3_000_000,
-            within: Within { max_speed: Some(100.0), travel: Some((-1.0, 1.0)), max_power: None },
+            within: DriveLimits { max_speed: Some(100.0), travel: Some((-1.0, 1.0)), max_power: None },
         };
         let signal = |node, what| Signal { node, what };
         let series = Series { label: "x".into(), slot: Slot(9), unit: Unit::parse("mm").unwrap(), boolean: false };
@@ -177,9 +177,9 @@ mod tests {
             steps: 2,
             buses: vec![Bus { name: "can0".into(), address: "sim:bench".into(), bit_rate: 1_000_000 }],
             nodes: vec![node("load", Kind::Cia402(drive)), node("shaft", Kind::Frames(vec![message]))],
-            inputs: vec![Input { signal: signal(1, What::Field(0, 0)), slot: Slot(4), start: 0.5, needed: true }],
+            inputs: vec![Input { signal: signal(1, SignalKind::Field(0, 0)), slot: Slot(4), start: 0.5, needed: true }],
             outputs: vec![Output {
-                signal: signal(0, What::Torque),
+                signal: signal(0, SignalKind::Torque),
                 slot: Slot(5),
                 low: -1.0,
                 high: f64::INFINITY,
@@ -193,8 +193,8 @@ mod tests {
             predict: Some(0),
             needs_look: true,
             plant: Plant {
-                applied: vec![(signal(0, What::Torque), Slot(3))],
-                seen: vec![(signal(0, What::Position), Slot(7))],
+                applied: vec![(signal(0, SignalKind::Torque), Slot(3))],
+                seen: vec![(signal(0, SignalKind::Position), Slot(7))],
                 inertia: None,
             },
         }

@@ -196,10 +196,10 @@ pub fn linear(
             diagnostics.extend(frontend::delays::linear(system));
             analysis::linearise::open(system, &ports, diagnostics)
         })?;
-    let wanted: Vec<lower::Wanted> = opened
+    let wanted: Vec<lower::Observed> = opened
         .outputs
         .iter()
-        .map(|(path, expr)| lower::Wanted { expr: *expr, text: path.clone(), unit: None })
+        .map(|(path, expr)| lower::Observed { expr: *expr, text: path.clone(), unit: None })
         .collect();
     let lower::Lowered { program, observed } = lower::lower(&system, &types, &wanted);
     let slot = |path: &str| program.description.quantity(path).map(|quantity| quantity.slot);
@@ -302,7 +302,7 @@ fn lowered_rig(
 }
 
 /// Code of the previous case, and the program that it was made from.
-struct Made {
+struct CachedCode {
     program: ir::program::Program,
     method: Method,
     code: Code,
@@ -311,7 +311,7 @@ struct Made {
     notes: Vec<String>,
 }
 
-impl Made {
+impl CachedCode {
     /// Whether a program has the same code: it may differ only in the values of its parameters.
     fn fits(&self, program: &ir::program::Program, method: Method) -> bool {
         let ir::program::Program {
@@ -335,7 +335,7 @@ impl Made {
 
 /// Makes a case runnable. Cases of a sweep over parameters differ only in numbers of the block, so each reuses the code
 /// of the previous one.
-fn case(variant: experiment::Variant, interpret: bool, made: &mut Option<Made>) -> Case {
+fn case(variant: experiment::Variant, interpret: bool, made: &mut Option<CachedCode>) -> Case {
     let experiment::Variant { label, mut program, adaptive, mut experiment, mut rig, .. } = variant;
     let stepped = rig.as_mut().map_or(&mut program, |(_, plant)| plant);
     if experiment.solver.method != Method::Adaptive && !stepped.description.delays.is_empty() {
@@ -347,9 +347,9 @@ fn case(variant: experiment::Variant, interpret: bool, made: &mut Option<Made>) 
         let (code, notes) = codegen::tiering::late(&program, method, interpret);
         let adaptive =
             adaptive.as_ref().map(|program| codegen::tiering::on_demand(program, Method::Adaptive, interpret));
-        *made = Some(Made { program, method, code, adaptive, notes });
+        *made = Some(CachedCode { program, method, code, adaptive, notes });
     }
-    let Made { code, adaptive: adaptive_code, notes, .. } = made.as_ref().expect("it was just made");
+    let CachedCode { code, adaptive: adaptive_code, notes, .. } = made.as_ref().expect("it was just made");
     let mut instance = Instance::new(description, code.clone(), &params);
     if let Some((program, code)) = adaptive.zip(adaptive_code.clone()) {
         instance = instance.with_adaptive(Arc::new(Instance::new(Arc::new(program.description), code, &params)));
@@ -469,7 +469,7 @@ pub fn quantities(
     sources: &dyn Sources,
     experiment: &str,
     changes: &Changes,
-) -> Result<Vec<analysis::explain::Listed>, Vec<Diagnostic>> {
+) -> Result<Vec<analysis::explain::QuantityInfo>, Vec<Diagnostic>> {
     let variant = first(loaded, sources, experiment, changes, &mut Vec::new())?;
     Ok(analysis::explain::quantities(&variant.system, &variant.types, &loaded.files))
 }
@@ -555,7 +555,7 @@ fn opened<T>(
         data: Vec::new(),
         frame: None,
     };
-    let frontend::flatten::Flat { mut system, mut diagnostics, .. } =
+    let frontend::flatten::Flattened { mut system, mut diagnostics, .. } =
         frontend::flatten::flatten(loaded, sources, &request);
     let opened = open(&mut system, &mut diagnostics);
     let types = analyse(&system, &loaded.files, depth, &Diagnostic::is_error, &mut diagnostics);
@@ -715,7 +715,8 @@ fn with_defaults(loaded: &Loaded, sources: &dyn Sources, model: &grammar::ast::M
         data: Vec::new(),
         frame: None,
     };
-    let frontend::flatten::Flat { system, mut diagnostics, .. } = frontend::flatten::flatten(loaded, sources, &request);
+    let frontend::flatten::Flattened { system, mut diagnostics, .. } =
+        frontend::flatten::flatten(loaded, sources, &request);
     let depth = if loaded.has_errors() { Depth::Values } else { Depth::Domains };
     analyse(&system, &loaded.files, depth, &Diagnostic::is_error, &mut diagnostics);
     diagnostics.retain(Diagnostic::is_error);

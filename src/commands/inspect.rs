@@ -7,7 +7,7 @@ use crate::quantity::{count, significant};
 use crate::terminal::{Style, Terminal};
 use abi::foreign::shown;
 use abi::image::Image;
-use abi::live::{Live, Place};
+use abi::live::{Live, Tunable};
 use abi::rig::Rig;
 use abi::{Description, Function};
 use runtime::format::utc;
@@ -94,8 +94,8 @@ fn settable(live: &Live) -> String {
     let (mut may, mut start) = (String::new(), String::new());
     for param in &live.params {
         match &param.place {
-            Place::Live(..) => may += &format!(" {}", shown(&param.path)),
-            Place::Start(why) => start += &format!("\n    {}: {}", shown(&param.path), shown(why)),
+            Tunable::Live(..) => may += &format!(" {}", shown(&param.path)),
+            Tunable::Start(why) => start += &format!("\n    {}: {}", shown(&param.path), shown(why)),
         }
     }
     let nothing = || " nothing".to_string();

@@ -11,7 +11,7 @@ mod summary;
 use super::shared::progress;
 use super::{End, has_experiment, load, reported};
 use crate::args::Sweep;
-use crate::compile::{self, Changes, Fitted, Loaded, Options, Stopwatch, Varying};
+use crate::compile::{self, Changes, Loaded, Options, PreparedRun, Stopwatch, Varying};
 use crate::parquet::{self, Holds};
 use crate::plot::{self, Axis};
 use crate::quantity::{self, count, significant};
@@ -246,7 +246,7 @@ impl Table {
             let Some(lanes) = self.cases[at].lanes().filter(|lanes| each >= lanes.width() as u64 / 2) else {
                 let row = match self.fitted(number, dice) {
                     Ok((run, fitted)) => {
-                        let Fitted { instance, experiment } = fitted;
+                        let PreparedRun { instance, experiment } = fitted;
                         self.row(run, engine::run(instance, &experiment, watch))
                     }
                     Err(row) => Some(row),
@@ -279,10 +279,10 @@ impl Table {
     }
 
     /// A run with its values; or the row of a run that its values do not allow.
-    fn fitted(&self, number: u64, dice: &Dice) -> Result<(Run, Fitted), Vec<u8>> {
+    fn fitted(&self, number: u64, dice: &Dice) -> Result<(Run, PreparedRun), Vec<u8>> {
         let (at, values) = self.values(number, dice);
         let given: Vec<(Slot, f64)> = self.slots[at].iter().copied().zip(values.iter().copied()).collect();
-        let description = |fitted: &Fitted| fitted.instance.description().clone();
+        let description = |fitted: &PreparedRun| fitted.instance.description().clone();
         match self.cases[at].fit(&given) {
             Ok(fitted) => Ok((Run { number, at, values, description: description(&fitted) }, fitted)),
             Err(broken) => Err(self.cells(number, at, &values, &[], &[], &format!("not run: {broken}"))),

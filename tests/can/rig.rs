@@ -3,7 +3,7 @@
 #[path = "../../runtime/src/testing/nodes.rs"]
 mod nodes;
 
-use abi::rig::{Mode, Rig, What};
+use abi::rig::{Mode, Rig, SignalKind};
 use runtime::can::socketcan::SocketCan;
 use runtime::can::{Bus, Options, Received};
 use runtime::drive::Bench;
@@ -15,7 +15,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 /// The rig and its program, with this period.
 pub fn pulsed(period_ns: u64) -> Identification {
     let drive = |name: &str, node| nodes::drive(name, node, Mode::Torque, period_ns);
-    let output = |node| nodes::output(node, What::Torque, abi::Slot::TIME, [-1.0, 1.0]);
+    let output = |node| nodes::output(node, SignalKind::Torque, abi::Slot::TIME, [-1.0, 1.0]);
     let rig = Rig {
         outputs: vec![output(0), output(1)],
         ..nodes::rig("gate", "socketcan:can0", period_ns, vec![drive("load", 3), drive("servo", 4)])

@@ -14,7 +14,7 @@ use crate::ir::build::{Build, Env};
 use crate::ir::expr::Shared;
 use crate::ir::program::Program;
 use crate::ir::{Func, Op, Value};
-use crate::lower::{Lowered, Wanted, lower};
+use crate::lower::{Lowered, Observed, lower};
 use crate::numerics::autodiff;
 use abi::description::Slot;
 use abi::format::{prefixed, quantity, three_digits};
@@ -112,14 +112,14 @@ impl Bench {
             return None;
         }
         let energy = system.storages.iter().find(|(owner, _)| *owner == InstanceId(0));
-        let energy = energy.map(|(_, expr)| Wanted { expr: *expr, text: "storage".into(), unit: None });
+        let energy = energy.map(|(_, expr)| Observed { expr: *expr, text: "storage".into(), unit: None });
         let stored = energy.is_some();
-        let mut wanted: Vec<Wanted> = energy.into_iter().collect();
+        let mut wanted: Vec<Observed> = energy.into_iter().collect();
         let automaton = system.automata.first();
         for (k, regime) in automaton.iter().flat_map(|automaton| &automaton.regimes).enumerate() {
             let exit = |(i, transition): (usize, &Transition)| {
                 let text = format!("exit {i} of regime {k}");
-                Wanted { expr: transition.condition, text, unit: None }
+                Observed { expr: transition.condition, text, unit: None }
             };
             wanted.extend(regime.transitions.iter().enumerate().map(exit));
         }

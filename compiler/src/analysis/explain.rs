@@ -29,7 +29,7 @@ pub struct Explanation {
     /// Name of the model.
     pub model: String,
     /// Its quantities and those of its parts, in the order of the text.
-    pub quantities: Vec<Listed>,
+    pub quantities: Vec<QuantityInfo>,
     /// Equations in order of evaluation: left side, right side as written.
     pub equations: Vec<(String, String)>,
     /// For each computed quantity, the paths that its equation mentions.
@@ -69,7 +69,7 @@ pub struct StepCost {
 
 /// A quantity in an explanation.
 #[derive(Clone, PartialEq, Debug)]
-pub struct Listed {
+pub struct QuantityInfo {
     /// `param`, `input`, …
     pub kind: &'static str,
     /// Dotted path.
@@ -88,7 +88,7 @@ pub struct Stepped {
     /// Dotted path.
     pub path: String,
     /// How its rate depends on the state itself.
-    pub own: Own,
+    pub own: SelfDependence,
     /// The greatest magnitude of its own rate found, in 1/s, and the velocity there in m/s for models with an input
     /// `v`.
     pub fastest: Option<(f64, Option<f64>)>,
@@ -96,7 +96,7 @@ pub struct Stepped {
 
 /// How the rate of a state depends on the state itself.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
-pub enum Own {
+pub enum SelfDependence {
     /// Not at all: a pure integrator.
     Not,
     /// f = a·x + b with a and b independent of x, in each branch: `expo` is exact.
@@ -143,11 +143,11 @@ pub fn explain(system: &System, types: &Types, files: &Files) -> Explanation {
 }
 
 /// Every quantity in the order of the text; those of a part follow their owner.
-pub fn quantities(system: &System, types: &Types, files: &Files) -> Vec<Listed> {
+pub fn quantities(system: &System, types: &Types, files: &Files) -> Vec<QuantityInfo> {
     let listed = |id: VarId| {
         let var = system.var(id);
         let unit = &types.units[id.0 as usize];
-        Listed {
+        QuantityInfo {
             kind: var.kind.word(),
             path: var.path.clone(),
             unit: if types.boolean_vars[id.0 as usize] { "true or false".into() } else { unit.to_string() },
@@ -285,9 +285,9 @@ pub fn states(system: &System, program: &Program) -> Vec<Stepped> {
     for (k, slot) in slots.iter().enumerate() {
         let gradient = gradients.get(&layout.derivatives.slot(k)).and_then(|g| autodiff::entry(g, k as u32));
         own.push(match gradient {
-            None => Own::Not,
-            Some(rate) if depends(&build, rate, *slot) => Own::Nonlinear,
-            Some(_) => Own::Affine,
+            None => SelfDependence::Not,
+            Some(rate) if depends(&build, rate, *slot) => SelfDependence::Nonlinear,
+            Some(_) => SelfDependence::Affine,
         });
         let rate = gradient.unwrap_or_else(|| build.real(0.0));
         build.store(layout.derivatives.slot(k), rate);
@@ -328,7 +328,7 @@ pub fn states(system: &System, program: &Program) -> Vec<Stepped> {
                 k += 1;
             }
             Definition::Sampled { .. } => {
-                out.push(Stepped { path: var.path.clone(), own: Own::Sampled, fastest: None })
+                out.push(Stepped { path: var.path.clone(), own: SelfDependence::Sampled, fastest: None })
             }
             _ => {}
         }
@@ -413,10 +413,10 @@ impl Stepped {
     pub fn words(&self) -> String {
         let name = self.path.rsplit('.').next().unwrap_or(&self.path);
         let mut text = match self.own {
-            Own::Not => format!("integrated: its rate is free of {name}"),
-            Own::Affine => format!("linear in {name}: expo steps it exactly, at any step"),
-            Own::Nonlinear => format!("not linear in {name}: expo linearises it in each step"),
-            Own::Sampled => "sampled: it changes at ticks".to_string(),
+            SelfDependence::Not => format!("integrated: its rate is free of {name}"),
+            SelfDependence::Affine => format!("linear in {name}: expo steps it exactly, at any step"),
+            SelfDependence::Nonlinear => format!("not linear in {name}: expo linearises it in each step"),
+            SelfDependence::Sampled => "sampled: it changes at ticks".to_string(),
         };
         if let Some((rate, at)) = self.fastest {
             let at = at.map_or(String::new(), |v| format!(" at v = {} m/s", three_digits(v)));

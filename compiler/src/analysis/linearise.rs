@@ -38,7 +38,7 @@ pub type PortSlots = (Vec<(String, Slot)>, Vec<(String, Slot)>);
 
 /// Inputs and outputs found in a system.
 #[derive(Default)]
-pub struct Opened {
+pub struct OpenPorts {
     /// Path of each input, and of the quantity that perturbs it: the input itself, or a quantity added to it.
     pub inputs: Vec<(String, String)>,
     /// Path of each output, and its value.
@@ -46,8 +46,8 @@ pub struct Opened {
 }
 
 /// Finds inputs and outputs. Adds a perturbation to each input that has a value of its own.
-pub fn open(system: &mut System, ports: &Ports, diagnostics: &mut Vec<Diagnostic>) -> Opened {
-    let mut opened = Opened::default();
+pub fn open(system: &mut System, ports: &Ports, diagnostics: &mut Vec<Diagnostic>) -> OpenPorts {
+    let mut opened = OpenPorts::default();
     for id in chosen(system, &ports.inputs, &[VarKind::Input], "input", diagnostics) {
         let var = system.var(id).clone();
         match var.definition {

@@ -56,14 +56,14 @@ pub struct Unstable {
     pub rate: f64,
     /// The state or input on whose magnitude the instability depends; `None` if the step is unstable at the start
     /// point.
-    pub along: Option<Along>,
+    pub along: Option<StabilityLimit>,
     /// The largest stable step at the worst point, in s.
     pub stable: f64,
 }
 
 /// A quantity along which a step becomes unstable.
 #[derive(Clone, PartialEq, Debug)]
-pub struct Along {
+pub struct StabilityLimit {
     /// Slot of the quantity.
     pub slot: Slot,
     /// The step is stable up to this magnitude, SI units.
@@ -307,7 +307,7 @@ impl<'a> Bench<'a> {
                 false => self.edge(setting, scan.slot, farthest.copysign(value), &scan),
             };
             let block = point(edge);
-            let along = Along { slot: scan.slot, limit: low.abs(), farthest: edge.abs(), inward, closed };
+            let along = StabilityLimit { slot: scan.slot, limit: low.abs(), farthest: edge.abs(), inward, closed };
             let stable = self.largest(&stepper, &block, h);
             return Some(Unstable { state, rate: self.rate(&block, state), along: Some(along), stable });
         }

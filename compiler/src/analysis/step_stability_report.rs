@@ -4,9 +4,9 @@
 //! ranges are open or the model itself grows too fast for `implicit`; W0705 for chattering. The analysis itself is in
 //! [`step_stability`](crate::analysis::step_stability).
 
-use crate::analysis::explain::{Own, states};
+use crate::analysis::explain::{SelfDependence, states};
 use crate::analysis::memo::Memo;
-use crate::analysis::step_stability::{Along, Bench, Chatter, Singular, Unstable, ten_to};
+use crate::analysis::step_stability::{Bench, Chatter, Singular, StabilityLimit, Unstable, ten_to};
 use crate::frontend::source::Files;
 use crate::frontend::system::*;
 use crate::frontend::units::Types;
@@ -96,7 +96,7 @@ impl Fixed<'_> {
         let var = system.var(id);
         let (method, step) = (self.method.name(), duration(self.step, 3));
         let own = states(system, self.program).into_iter().find(|state| state.path == var.path).map(|state| state.own);
-        let linear = own == Some(Own::Affine) && self.method.row().steps == Steps::Explicit;
+        let linear = own == Some(SelfDependence::Affine) && self.method.row().steps == Steps::Explicit;
         let stiff = unstable.rate * self.step > 1.0;
         let place = match system.instance(var.instance).path.is_empty() {
             true => self.run,
@@ -207,7 +207,7 @@ impl Fixed<'_> {
     }
 
     /// The name that the owner of a state has for the varied quantity, and its unit.
-    fn name_of(&self, along: &Along, owner: InstanceId) -> Option<(String, Unit)> {
+    fn name_of(&self, along: &StabilityLimit, owner: InstanceId) -> Option<(String, Unit)> {
         let system = self.system;
         let moved = self.program.description.quantities.iter().find(|quantity| quantity.slot == along.slot)?;
         let moved = system.var_ids().find(|id| system.var(*id).path == moved.path)?;
@@ -231,7 +231,7 @@ impl Fixed<'_> {
     }
 
     /// The span of the bound: the number in the condition that ends a run, or a range.
-    fn end(&self, along: &Along) -> Option<Span> {
+    fn end(&self, along: &StabilityLimit) -> Option<Span> {
         let system = self.system;
         let near = |id: ExprId| {
             let value = crate::lower::evaluate(system, self.types, &[id])[0].abs();

@@ -6,7 +6,7 @@
 pub mod start_values;
 pub mod vary;
 
-use crate::analysis::linearise::{Opened, PortSlots, Ports, open};
+use crate::analysis::linearise::{OpenPorts, PortSlots, Ports, open};
 use crate::analysis::parameter_checks;
 use crate::codegen::elementary::Alone;
 use crate::frontend::delays;
@@ -17,9 +17,9 @@ use crate::frontend::system::*;
 use crate::frontend::tables::columns as columns_of;
 use crate::frontend::units::Types;
 use crate::ir::Binary;
-use crate::lower::{Lowered, MOST_DENSE, Wanted, evaluate, lower};
+use crate::lower::{Lowered, MOST_DENSE, Observed, evaluate, lower};
 use crate::pipeline::{Depth, analyse};
-use crate::rig::{self, Prepared};
+use crate::rig::{self, LoadedRig};
 use abi::plan::{self, Formula, MeasureKind, Method, PARTS, Solver};
 use abi::unit::{Dimension, Unit};
 use grammar::ast::{self, BinaryOp, ExperimentStatement, Expr, SweepOver};
@@ -53,7 +53,7 @@ pub struct Changes {
 
 /// A number of a plan that an expression determines.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
-pub enum Place {
+pub enum PlanNumber {
     /// Duration of the run.
     Duration,
     /// Fixed step.
@@ -87,7 +87,7 @@ pub struct Variant {
     /// The plan of the run.
     pub experiment: plan::Experiment,
     /// Numbers of the plan that depend on expressions.
-    pub places: Vec<(Place, ExprId)>,
+    pub places: Vec<(PlanNumber, ExprId)>,
     /// Inputs of a linearisation, each with the slot that perturbs it, and its outputs.
     pub ports: PortSlots,
     /// For software in the loop: the plan of the rig, and the program of the part that hardware would replace.
@@ -104,7 +104,7 @@ const MOST_STEPS: f64 = 1e12;
 pub const MOST_VARIANTS: usize = 100_000;
 
 /// The statements of an experiment, by kind.
-struct Parts<'a> {
+struct Statements<'a> {
     span: Span,
     run: &'a ast::Run,
     solver: Option<&'a ast::Solver>,
@@ -135,7 +135,7 @@ pub fn read(
     on_stage: &mut dyn FnMut(&'static str),
 ) -> Result<Vec<Variant>, Vec<Diagnostic>> {
     let mut diagnostics = Vec::new();
-    let given = Given::read(loaded, changes, &mut diagnostics);
+    let given = CommandLine::read(loaded, changes, &mut diagnostics);
     let also = also(loaded, &changes.also, &mut diagnostics);
     let root = loaded.root();
     let prepared = rig_of(loaded, sources, name, &given, &mut diagnostics)?;
@@ -194,7 +194,7 @@ pub fn read(
     let mut variants = Vec::new();
     for combination in combinations {
         let label = label(loaded, &combination);
-        let changes = combination.iter().map(|(change, _)| *change).chain(given.set.iter().map(Given::change));
+        let changes = combination.iter().map(|(change, _)| *change).chain(given.set.iter().map(CommandLine::change));
         let written = arg_paths.iter().zip(args).map(|(path, bind)| {
             let value = match &bind.value {
                 ast::BindValue::Expr(expr) => OverrideValue::Expr(expr),
@@ -237,7 +237,7 @@ fn also(loaded: &mut Loaded, texts: &[String], diagnostics: &mut Vec<Diagnostic>
 }
 
 /// The changes of the command line, parsed.
-struct Given {
+struct CommandLine {
     set: Vec<Set>,
     method: Option<Method>,
     step: Option<f64>,
@@ -260,7 +260,7 @@ pub struct Overrides(Vec<Set>);
 impl Overrides {
     /// The changes one by one.
     pub fn iter(&self) -> impl Iterator<Item = ChangeOf<'_>> {
-        self.0.iter().map(|set| ChangeOf(Given::change(set)))
+        self.0.iter().map(|set| ChangeOf(CommandLine::change(set)))
     }
 }
 
@@ -276,11 +276,11 @@ impl<'a> ChangeOf<'a> {
 
 /// Parses changes of values from outside.
 pub fn overrides(loaded: &mut Loaded, changes: &Changes, diagnostics: &mut Vec<Diagnostic>) -> Overrides {
-    Overrides(Given::read(loaded, changes, diagnostics).set)
+    Overrides(CommandLine::read(loaded, changes, diagnostics).set)
 }
 
-impl Given {
-    fn read(loaded: &mut Loaded, changes: &Changes, diagnostics: &mut Vec<Diagnostic>) -> Given {
+impl CommandLine {
+    fn read(loaded: &mut Loaded, changes: &Changes, diagnostics: &mut Vec<Diagnostic>) -> CommandLine {
         let mut set = Vec::new();
         for text in &changes.set {
             let id = loaded.add_text("--set", text);
@@ -306,7 +306,7 @@ impl Given {
             }
         }
         let Changes { method, step, tol, duration, vary, ports, .. } = changes.clone();
-        Given { set, method, step, tol, duration, vary, ports }
+        CommandLine { set, method, step, tol, duration, vary, ports }
     }
 
     fn change(set: &Set) -> Change<'_> {
@@ -325,7 +325,11 @@ fn looks_like_instance(value: &str) -> bool {
     value.starts_with(|c: char| c.is_ascii_uppercase()) && name.trim_start().starts_with('(')
 }
 
-fn parts<'a>(experiment: &'a ast::Experiment, misread: bool, diagnostics: &mut Vec<Diagnostic>) -> Option<Parts<'a>> {
+fn parts<'a>(
+    experiment: &'a ast::Experiment,
+    misread: bool,
+    diagnostics: &mut Vec<Diagnostic>,
+) -> Option<Statements<'a>> {
     let mut run: Option<&ast::Run> = None;
     let mut parts = (None, Vec::new(), None, Vec::new(), Vec::new());
     let mut stepped = false;
@@ -365,7 +369,7 @@ fn parts<'a>(experiment: &'a ast::Experiment, misread: bool, diagnostics: &mut V
         return None;
     };
     let (solver, sweeps, data, plots, expects) = parts;
-    Some(Parts { span: experiment.span, run, solver, sweeps, data, plots, expects, stepped })
+    Some(Statements { span: experiment.span, run, solver, sweeps, data, plots, expects, stepped })
 }
 
 /// Columns of a recording as tables over time.
@@ -426,7 +430,7 @@ fn recording(
 }
 
 /// The values of each sweep `first .. last by step` as literals.
-fn grids(loaded: &Loaded, parts: &Parts, diagnostics: &mut Vec<Diagnostic>) -> Vec<Vec<Expr>> {
+fn grids(loaded: &Loaded, parts: &Statements, diagnostics: &mut Vec<Diagnostic>) -> Vec<Vec<Expr>> {
     let mut out = Vec::new();
     for sweep in &parts.sweeps {
         let mut values = Vec::new();
@@ -474,7 +478,7 @@ fn quantity(expr: &Expr) -> Option<(f64, Unit, Option<ast::UnitText>)> {
 }
 
 /// All combinations of the sweeps, the last sweep varying fastest, each with the text of its value.
-fn combinations<'a>(parts: &Parts<'a>, grids: &'a [Vec<Expr>]) -> Vec<Vec<(Change<'a>, Option<String>)>> {
+fn combinations<'a>(parts: &Statements<'a>, grids: &'a [Vec<Expr>]) -> Vec<Vec<(Change<'a>, Option<String>)>> {
     let mut out: Vec<Vec<(Change<'a>, Option<String>)>> = vec![Vec::new()];
     for (sweep, grid) in parts.sweeps.iter().zip(grids) {
         let path = &sweep.path;
@@ -543,11 +547,11 @@ fn variant(
     loaded: &Loaded,
     sources: &dyn Sources,
     name: &str,
-    parts: &Parts,
-    prepared: Option<&Prepared>,
+    parts: &Statements,
+    prepared: Option<&LoadedRig>,
     data: &[(String, Table, Unit)],
     overrides: Vec<Override>,
-    given: &Given,
+    given: &CommandLine,
     label: String,
     warnings: &mut Vec<Diagnostic>,
     on_stage: &mut dyn FnMut(&'static str),
@@ -591,7 +595,7 @@ fn variant(
             let types = std::mem::take(&mut cut.control_types);
             // Warnings concern the rig, and are not repeated for each of its experiments.
             diagnostics.retain(Diagnostic::is_error);
-            (system, types, std::mem::take(&mut cut.observed), Opened::default(), Some(cut))
+            (system, types, std::mem::take(&mut cut.observed), OpenPorts::default(), Some(cut))
         }
         None => {
             let instance = Instance::Written(&parts.run.instance, root);
@@ -633,7 +637,7 @@ fn variant(
     let duration = match (given.duration, duration) {
         (Some(duration), _) => duration,
         (None, Some(at)) => {
-            reader.places.push((Place::Duration, nodes[at]));
+            reader.places.push((PlanNumber::Duration, nodes[at]));
             reader.time(nodes[at], "the duration")
         }
         (None, None) => match data.first().and_then(|(_, table, _)| table.x.last()) {
@@ -775,9 +779,9 @@ fn rig_of(
     loaded: &mut Loaded,
     sources: &dyn Sources,
     experiment: &str,
-    given: &Given,
+    given: &CommandLine,
     diagnostics: &mut Vec<Diagnostic>,
-) -> Result<Option<Prepared>, Vec<Diagnostic>> {
+) -> Result<Option<LoadedRig>, Vec<Diagnostic>> {
     let root = loaded.root();
     let ast = loaded.files.get(root).ast.clone();
     let run = ast.items().find_map(|item| match item {
@@ -834,8 +838,8 @@ struct Reader<'a> {
     system: &'a System,
     types: &'a Types,
     diagnostics: Vec<Diagnostic>,
-    wanted: Vec<Wanted>,
-    places: Vec<(Place, ExprId)>,
+    wanted: Vec<Observed>,
+    places: Vec<(PlanNumber, ExprId)>,
     /// Paths of parameters that vary from run to run.
     vary: &'a [String],
     /// Index of the present expectation.
@@ -884,7 +888,7 @@ impl Reader<'_> {
         value
     }
 
-    fn solver(&mut self, parts: &Parts, given: &Given, step: Option<ExprId>, tol: Option<ExprId>) -> Solver {
+    fn solver(&mut self, parts: &Statements, given: &CommandLine, step: Option<ExprId>, tol: Option<ExprId>) -> Solver {
         let written = parts.solver.and_then(|solver| {
             let method = Method::named(&solver.method.text);
             if method.is_none() {
@@ -896,11 +900,11 @@ impl Reader<'_> {
         });
         let method = given.method.or(written).unwrap_or(Method::Adaptive);
         if let (None, Some(step)) = (given.step, step) {
-            self.places.push((Place::Step, step));
+            self.places.push((PlanNumber::Step, step));
         }
         let step = given.step.or_else(|| step.map(|step| self.time(step, "the step")));
         if let (None, Some(tol)) = (given.tol, tol) {
-            self.places.push((Place::Tolerance, tol));
+            self.places.push((PlanNumber::Tolerance, tol));
         }
         let tol = given.tol.or_else(|| tol.map(|tol| self.constant(tol))).unwrap_or(DEFAULT_TOL);
         if !(tol > 0.0 && tol < 1.0) {
@@ -916,7 +920,7 @@ impl Reader<'_> {
     }
 
     /// Method and step of the plant between ticks. The step must divide the period.
-    fn between_ticks(&mut self, parts: &Parts, given: &Given, period: f64, solver: Solver) -> Solver {
+    fn between_ticks(&mut self, parts: &Statements, given: &CommandLine, period: f64, solver: Solver) -> Solver {
         let usual = Solver { method: Method::Expo, step: period / f64::from(rig::PLANT_STEPS), ..solver };
         if given.method.is_none() && parts.solver.is_none() {
             return match given.step {
@@ -937,7 +941,7 @@ impl Reader<'_> {
         }
     }
 
-    fn divides(&mut self, parts: &Parts, period: f64, solver: Solver) -> Solver {
+    fn divides(&mut self, parts: &Statements, period: f64, solver: Solver) -> Solver {
         let ratio = period / solver.step;
         if (ratio - ratio.round()).abs() > 1e-9 * ratio || !(1.0..=1e5).contains(&ratio.round()) {
             let span = parts.solver.map_or(parts.run.span, |solver| solver.span);
@@ -952,7 +956,7 @@ impl Reader<'_> {
     fn want(&mut self, expr: ExprId, unit: Option<Unit>) -> usize {
         let text = one_line(self.loaded.files.slice(self.system.span(expr)));
         let unit = unit.or_else(|| Some(self.own_unit(expr)));
-        self.wanted.push(Wanted { expr, text, unit });
+        self.wanted.push(Observed { expr, text, unit });
         self.wanted.len() - 1
     }
 
@@ -1083,7 +1087,7 @@ impl Reader<'_> {
                 self.shown_in(value_node, target_node, Formula::Near { value, target, tolerance, relative })
             }
         };
-        for (at, place) in [(at.after, Place::After(self.expect)), (at.before, Place::Before(self.expect))] {
+        for (at, place) in [(at.after, PlanNumber::After(self.expect)), (at.before, PlanNumber::Before(self.expect))] {
             self.places.extend(at.map(|at| (place, nodes[at])));
         }
         let mut edge = |at: Option<usize>, default: f64| match at {
@@ -1164,20 +1168,22 @@ impl Reader<'_> {
                     _ => None,
                 };
                 if let Some(second) = second.filter(|_| moment.is_none()) {
-                    self.places.push((Place::Second(self.expect, measures.len()), second));
+                    self.places.push((PlanNumber::Second(self.expect, measures.len()), second));
                 }
                 let second = second.map(|second| if moment.is_some() { f64::NAN } else { self.constant(second) });
                 if second.is_some_and(f64::is_nan) && moment.is_none() {
                     return self.unknown_before(id);
                 }
-                let after = window.after.map(|edge| self.edge(edge, Place::MeasureAfter(self.expect, measures.len())));
-                let before = window.before.map(|e| self.edge(e, Place::MeasureBefore(self.expect, measures.len())));
+                let after =
+                    window.after.map(|edge| self.edge(edge, PlanNumber::MeasureAfter(self.expect, measures.len())));
+                let before =
+                    window.before.map(|e| self.edge(e, PlanNumber::MeasureBefore(self.expect, measures.len())));
                 let open = || Some(plan::Edge::Open);
                 let window = plan::Window { after: after.unwrap_or_else(open)?, before: before.unwrap_or_else(open)? };
                 if name == MeasureName::Time {
                     return match *self.system.node(value) {
                         Node::Measure(MeasureName::Peak, of, Some(number), inner) if inner == Window::default() => {
-                            self.places.push((Place::Second(self.expect, measures.len()), number));
+                            self.places.push((PlanNumber::Second(self.expect, measures.len()), number));
                             let kind = MeasureKind::TimeOfPeak(self.number_of_peak(number)?);
                             Some(self.measure(id, of, kind, window, measures))
                         }
@@ -1318,7 +1324,7 @@ impl Reader<'_> {
     }
 
     /// An end of a measure's window: a time, or the first instant of a condition.
-    fn edge(&mut self, id: ExprId, place: Place) -> Option<plan::Edge> {
+    fn edge(&mut self, id: ExprId, place: PlanNumber) -> Option<plan::Edge> {
         match *self.system.node(id) {
             Node::Measure(MeasureName::First, of, None, Window { after: None, before: None }) if !self.measured(of) => {
                 Some(plan::Edge::First(abi::Slot(self.want(of, None) as u32)))

@@ -5,7 +5,7 @@
 //! duration, windows, corners, declared ranges and `require` conditions. Only code is compiled once.
 
 use crate::experiment::start_values;
-use crate::experiment::{Place, Variant, depends, is_number_of_peak};
+use crate::experiment::{PlanNumber, Variant, depends, is_number_of_peak};
 use crate::frontend::source::Files;
 use crate::frontend::system::*;
 use crate::ir::Func;
@@ -47,7 +47,7 @@ pub struct Varying {
 
 /// Use of a computed value.
 enum Use {
-    Plan(Place),
+    Plan(PlanNumber),
     Corner,
     /// A bound of a quantity: its index in the description, and whether it is the upper one.
     Bound(usize, bool),
@@ -79,7 +79,7 @@ pub struct Runnable {
 }
 
 /// Instance and plan for a run.
-pub struct Fitted {
+pub struct PreparedRun {
     /// The instance with its parameters.
     pub instance: Instance,
     /// The plan of the run.
@@ -139,7 +139,7 @@ impl Varying {
             uses.push(Use::Require(format!("{owner}{}", require.message.clone().unwrap_or_else(condition))));
         }
         let fixed = experiment.solver.method != Method::Adaptive;
-        let step_varies = uses.iter().any(|one| matches!(one, Use::Plan(Place::Step)));
+        let step_varies = uses.iter().any(|one| matches!(one, Use::Plan(PlanNumber::Step)));
         for block in system.blocks.iter().filter(|block| varies(block.period) || fixed && step_varies) {
             exprs.push(block.period);
             uses.push(Use::Period);
@@ -194,7 +194,7 @@ impl Varying {
     /// An instance and a plan for these values in SI units.
     ///
     /// # Errors The violated condition, in words.
-    pub fn fit(&self, values: &[(Slot, f64)]) -> Result<Fitted, String> {
+    pub fn fit(&self, values: &[(Slot, f64)]) -> Result<PreparedRun, String> {
         let mut instance = Instance::new(self.description.clone(), self.code.clone(), &self.params);
         if let Some(adaptive) = &self.adaptive {
             instance = instance.with_adaptive(adaptive.clone());
@@ -204,7 +204,7 @@ impl Varying {
         }
         let mut experiment = self.experiment.clone();
         if self.uses.is_empty() {
-            return Ok(Fitted { instance, experiment });
+            return Ok(PreparedRun { instance, experiment });
         }
         let mut block = vec![0.0; self.size];
         let params = self.description.layout.params.range();
@@ -284,7 +284,7 @@ impl Varying {
             // The adaptive program would check other ranges, so it is dropped.
             instance = Instance::new(Arc::new(description), self.code.clone(), &block);
         }
-        Ok(Fitted { instance, experiment })
+        Ok(PreparedRun { instance, experiment })
     }
 
     /// For a run with fixed steps: the violated range in words, from the readings of the expectations after those of
@@ -320,7 +320,7 @@ pub fn built_in(variant: &Variant, vary: &[String]) -> Option<Diagnostic> {
     if system.delays.is_empty() {
         return None;
     }
-    let steps = variant.places.iter().filter(|(place, _)| *place == Place::Step);
+    let steps = variant.places.iter().filter(|(place, _)| *place == PlanNumber::Step);
     let (expr, path) = steps.into_iter().find_map(|(_, expr)| Some((*expr, varied(*expr)?)))?;
     let error = Diagnostic::error("E0905", format!("`{path}` cannot be varied in one program"))
         .label(system.span(expr), "decides how much of the past `delay` keeps");
@@ -362,21 +362,21 @@ fn extremes(quantity: &Quantity, duration: f64) -> Expect {
     }
 }
 
-fn set(experiment: &mut Experiment, place: Place, number: f64) -> Result<(), String> {
+fn set(experiment: &mut Experiment, place: PlanNumber, number: f64) -> Result<(), String> {
     let positive = |what: &str| match number > 0.0 && number.is_finite() {
         true => Ok(number),
         false => Err(format!("{what} must be positive, not {number} s")),
     };
     match place {
-        Place::Duration => experiment.duration = positive("the duration")?,
-        Place::Step => experiment.solver.step = positive("the step")?,
-        Place::Tolerance if number > 0.0 && number < 1.0 => experiment.solver.tol = number,
-        Place::Tolerance => return Err(format!("a tolerance lies between 0 and 1: {number} does not")),
-        Place::After(k) => experiment.expects[k].after = number,
-        Place::Before(k) => experiment.expects[k].before = number.min(experiment.duration),
-        Place::MeasureAfter(k, j) => experiment.expects[k].measures[j].window.after = Edge::At(number),
-        Place::MeasureBefore(k, j) => experiment.expects[k].measures[j].window.before = Edge::At(number),
-        Place::Second(k, j) => match &mut experiment.expects[k].measures[j].kind {
+        PlanNumber::Duration => experiment.duration = positive("the duration")?,
+        PlanNumber::Step => experiment.solver.step = positive("the step")?,
+        PlanNumber::Tolerance if number > 0.0 && number < 1.0 => experiment.solver.tol = number,
+        PlanNumber::Tolerance => return Err(format!("a tolerance lies between 0 and 1: {number} does not")),
+        PlanNumber::After(k) => experiment.expects[k].after = number,
+        PlanNumber::Before(k) => experiment.expects[k].before = number.min(experiment.duration),
+        PlanNumber::MeasureAfter(k, j) => experiment.expects[k].measures[j].window.after = Edge::At(number),
+        PlanNumber::MeasureBefore(k, j) => experiment.expects[k].measures[j].window.before = Edge::At(number),
+        PlanNumber::Second(k, j) => match &mut experiment.expects[k].measures[j].kind {
             MeasureKind::At(second) | MeasureKind::Settling(second) => *second = number,
             MeasureKind::Peak(_) | MeasureKind::TimeOfPeak(_) if !is_number_of_peak(number) => {
                 return Err(format!("peaks have the numbers 1, 2, 3 and so on, not {number}"));

@@ -23,7 +23,7 @@ use std::sync::Arc;
 
 /// Location of a quantity's value at run time.
 #[derive(Clone, Copy, PartialEq, Debug)]
-enum Place {
+enum Location {
     /// Computed on demand.
     Computed,
     /// Stored in this slot.
@@ -31,7 +31,7 @@ enum Place {
 }
 
 /// An expression to observe as a quantity.
-pub struct Wanted {
+pub struct Observed {
     /// The expression.
     pub expr: ExprId,
     /// The expression as written.
@@ -49,7 +49,7 @@ pub struct Lowered {
 }
 
 /// Lowers a system; `wanted` are the expressions to observe.
-pub fn lower(system: &System, types: &Types, wanted: &[Wanted]) -> Lowered {
+pub fn lower(system: &System, types: &Types, wanted: &[Observed]) -> Lowered {
     let mut pool = [&crate::math::POOL, crate::numerics::rosenbrock::constants()].concat();
     let tables = Lookup::place_all(&system.tables, &mut pool);
     let mut plan = Plan::new(system, types, wanted, &believed(system), tables);
@@ -150,7 +150,7 @@ pub fn independent(system: &System) -> u32 {
 
 /// A value that [`of_params`] computes.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
-pub enum Sought {
+pub enum ParamValue {
     /// The value of a quantity. For an independent parameter this is the content of its slot.
     Var(VarId),
     /// An expression.
@@ -159,7 +159,7 @@ pub enum Sought {
 
 /// A program that computes these values from parameters alone, each into the output slot of its index, and the slot of
 /// each independent parameter. Values that are not constant during a run are NaN, as in [`evaluate`].
-pub fn of_params(system: &System, types: &Types, sought: &[Sought]) -> (Program, Vec<(VarId, Slot)>) {
+pub fn of_params(system: &System, types: &Types, sought: &[ParamValue]) -> (Program, Vec<(VarId, Slot)>) {
     let mut pool = crate::math::POOL.to_vec();
     let tables = Lookup::place_all(&system.tables, &mut pool);
     let mut plan = Plan::new(system, types, &[], &[], tables);
@@ -172,8 +172,8 @@ pub fn of_params(system: &System, types: &Types, sought: &[Sought]) -> (Program,
     let layout = Layout::new([params.len, 0, 0, 0, 0, count(sought.len()), 0, 0, 0, 0]);
     for (k, one) in sought.iter().enumerate() {
         let value = match one {
-            Sought::Var(id) => emit.stored(*id),
-            Sought::Expr(expr) => {
+            ParamValue::Var(id) => emit.stored(*id),
+            ParamValue::Expr(expr) => {
                 let value = emit.value(*expr);
                 emit.as_number(value, types.boolean[expr.0 as usize])
             }
@@ -183,8 +183,8 @@ pub fn of_params(system: &System, types: &Types, sought: &[Sought]) -> (Program,
     let description =
         Description { name: "judge".into(), layout, pool: plan.description.pool.clone(), ..Description::default() };
     let own = system.var_ids().filter_map(|id| match plan.places[id.0 as usize] {
-        Place::Slot(slot) if params.contains(slot) => Some((id, slot)),
-        Place::Slot(_) | Place::Computed => None,
+        Location::Slot(slot) if params.contains(slot) => Some((id, slot)),
+        Location::Slot(_) | Location::Computed => None,
     });
     let slots = own.collect();
     let outputs = emit.build.finish();
@@ -215,7 +215,7 @@ struct Plan<'a> {
     system: &'a System,
     types: &'a Types,
     description: Description,
-    places: Vec<Place>,
+    places: Vec<Location>,
     param_values: Vec<ExprId>,
     states: Vec<VarId>,
     sampled: Vec<VarId>,
@@ -240,7 +240,7 @@ enum Output {
 }
 
 /// Location of an observed value.
-enum Found {
+enum ObservedAt {
     /// In the slot of this quantity.
     Var(VarId),
     /// In the output slot of this index.
@@ -258,7 +258,7 @@ impl<'a> Plan<'a> {
     fn new(
         system: &'a System,
         types: &'a Types,
-        wanted: &[Wanted],
+        wanted: &[Observed],
         watched: &[VarId],
         tables: Vec<Lookup>,
     ) -> Plan<'a> {
@@ -285,20 +285,20 @@ impl<'a> Plan<'a> {
         let stored =
             |id: VarId| !matches!(system.var(id).definition, Definition::Value(..)) || independent[id.0 as usize];
         let named = |id: VarId, outputs: &mut Vec<Output>| match stored(id) {
-            true => Found::Var(id),
+            true => ObservedAt::Var(id),
             false => {
                 let known = outputs.iter().position(|output| matches!(output, Output::Var(other) if *other == id));
-                Found::Output(known.unwrap_or_else(|| added(outputs, Output::Var(id))))
+                ObservedAt::Output(known.unwrap_or_else(|| added(outputs, Output::Var(id))))
             }
         };
         let mut shared: HashMap<String, usize> = HashMap::new();
-        let mut observed_at: Vec<Found> = Vec::new();
+        let mut observed_at: Vec<ObservedAt> = Vec::new();
         for one in wanted {
             observed_at.push(match system.node(one.expr) {
                 Node::Var(id) => named(*id, &mut outputs),
                 _ => {
                     let at = shared.entry(one.text.clone());
-                    Found::Output(*at.or_insert_with(|| added(&mut outputs, Output::Expr(one.expr))))
+                    ObservedAt::Output(*at.or_insert_with(|| added(&mut outputs, Output::Expr(one.expr))))
                 }
             });
         }
@@ -306,10 +306,10 @@ impl<'a> Plan<'a> {
             let (value, _) = delays::of(system, *delay);
             match system.node(value) {
                 Node::Var(id) => named(*id, &mut outputs),
-                _ => Found::Output(added(&mut outputs, Output::Expr(value))),
+                _ => ObservedAt::Output(added(&mut outputs, Output::Expr(value))),
             }
         };
-        let sources: Vec<Found> = system.delays.iter().map(source).collect();
+        let sources: Vec<ObservedAt> = system.delays.iter().map(source).collect();
         let memory = sampled.len() + held.len() + system.blocks.len() + system.crossings.len() + system.events.len();
         let memory = memory + 5 * system.delays.len();
         let n = states.len();
@@ -329,10 +329,10 @@ impl<'a> Plan<'a> {
             ]
             .map(|len| len as u32),
         );
-        let mut places = vec![Place::Computed; system.vars.len()];
+        let mut places = vec![Location::Computed; system.vars.len()];
         let mut put = |vars: &[VarId], segment: abi::description::Segment, from: usize| {
             for (k, id) in vars.iter().enumerate() {
-                places[id.0 as usize] = Place::Slot(segment.slot(from + k));
+                places[id.0 as usize] = Location::Slot(segment.slot(from + k));
             }
         };
         put(&params, layout.params, 0);
@@ -349,11 +349,11 @@ impl<'a> Plan<'a> {
         let periods = take(system.blocks.len());
         let crossings = take(system.crossings.len());
         let events = take(system.events.len());
-        let slot_of = |at: &Found| match at {
-            Found::Output(at) => layout.outputs.slot(*at),
-            Found::Var(id) => match places[id.0 as usize] {
-                Place::Slot(slot) => slot,
-                Place::Computed => unreachable!("it is stored"),
+        let slot_of = |at: &ObservedAt| match at {
+            ObservedAt::Output(at) => layout.outputs.slot(*at),
+            ObservedAt::Var(id) => match places[id.0 as usize] {
+                Location::Slot(slot) => slot,
+                Location::Computed => unreachable!("it is stored"),
             },
         };
         let delays = system.delays.iter().zip(&sources).map(|(delay, source)| {
@@ -404,15 +404,15 @@ impl<'a> Plan<'a> {
 
     fn slot(&self, id: VarId) -> Option<Slot> {
         match self.places[id.0 as usize] {
-            Place::Slot(slot) => Some(slot),
-            Place::Computed => {
+            Location::Slot(slot) => Some(slot),
+            Location::Computed => {
                 let mine = |output: &Output| matches!(output, Output::Var(other) if *other == id);
                 self.outputs.iter().position(mine).map(|k| self.description.layout.outputs.slot(k))
             }
         }
     }
 
-    fn describe(&mut self, wanted: &[Wanted], watched: &[VarId]) {
+    fn describe(&mut self, wanted: &[Observed], watched: &[VarId]) {
         let system = self.system;
         let top = system.instances.first().map_or(String::new(), |top| top.model.clone());
         let mut quantities = Vec::new();
@@ -428,8 +428,8 @@ impl<'a> Plan<'a> {
         for id in system.var_ids() {
             let var = system.var(id);
             let slot = match self.places[id.0 as usize] {
-                Place::Slot(slot) => slot,
-                Place::Computed => match output_slots.get(&id) {
+                Location::Slot(slot) => slot,
+                Location::Computed => match output_slots.get(&id) {
                     Some(slot) => *slot,
                     None => continue,
                 },
@@ -996,7 +996,7 @@ impl<'a> Emit<'a> {
         match node {
             Node::Var(id) if self.replaced == Some(*id) => None,
             Node::Var(id) => {
-                let stored = matches!(self.plan.places[id.0 as usize], Place::Slot(_));
+                let stored = matches!(self.plan.places[id.0 as usize], Location::Slot(_));
                 let var = system.var(*id);
                 let param = matches!(var.definition, Definition::Value(..));
                 if stored && param && (!self.inline_params || self.loads_params) {
@@ -1079,7 +1079,7 @@ impl<'a> Emit<'a> {
         let value = self.got(behind);
         let (Node::Var(id), Phase::Tick) = (node, self.phase) else { return value };
         let Definition::Held { block, .. } = self.plan.system.var(*id).definition else { return value };
-        let Place::Slot(slot) = self.plan.places[id.0 as usize] else { return value };
+        let Location::Slot(slot) = self.plan.places[id.0 as usize] else { return value };
         let due = self.due(block);
         let before = self.build.load(slot);
         if self.plan.types.boolean_vars[id.0 as usize] {
@@ -1117,7 +1117,7 @@ impl<'a> Emit<'a> {
             return self.build.load(impulse::FORCE);
         }
         match self.plan.places[id.0 as usize] {
-            Place::Slot(slot) if !self.inline_params || self.loads_params && self.is_param(slot) => {
+            Location::Slot(slot) if !self.inline_params || self.loads_params && self.is_param(slot) => {
                 let value = self.build.load(slot);
                 if self.plan.types.boolean_vars[id.0 as usize] { self.truth(value) } else { value }
             }

@@ -94,7 +94,7 @@ pub fn coupling(func: &Func, rates: &[Slot], states: &[Slot]) -> Coupling {
 
 /// How a value depends on the states of a component jointly.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Debug)]
-enum Joint {
+enum StateDependence {
     /// Depends on no state.
     Given,
     /// Depends on states outside the component only.
@@ -107,13 +107,13 @@ enum Joint {
 
 /// Whether the rates of a component are jointly affine in its states, with coefficients that no state changes.
 fn is_linear(func: &Func, rates: &[Slot], states: &[Slot], component: &[usize]) -> bool {
-    use Joint::{Affine, Given, Moving, Nonlinear};
-    let times = |a: Joint, b: Joint| match (a.min(b), a.max(b)) {
+    use StateDependence::{Affine, Given, Moving, Nonlinear};
+    let times = |a: StateDependence, b: StateDependence| match (a.min(b), a.max(b)) {
         (Given, Affine) => Affine,
         (_, Affine | Nonlinear) => Nonlinear,
         (_, most) => most,
     };
-    let mut of: Vec<Joint> = Vec::with_capacity(func.ops.len());
+    let mut of: Vec<StateDependence> = Vec::with_capacity(func.ops.len());
     for op in &func.ops {
         let at = |value: Value| of[value.index()];
         of.push(match *op {

@@ -33,15 +33,15 @@ pub fn drop_limiter_tests(func: &Func) -> Func {
 
 /// The test whether x is beyond its limit and driven further out: `limit < |x|` or `limit ≤ |x|`, and `0 < x · rate`.
 #[derive(PartialEq)]
-struct Beyond {
+struct LimitTest {
     limit: Value,
     or_at: bool,
     x: Value,
     rate: Value,
 }
 
-impl Beyond {
-    fn of(build: &Build, truth: Value) -> Option<Beyond> {
+impl LimitTest {
+    fn of(build: &Build, truth: Value) -> Option<LimitTest> {
         let Op::And(a, b) = build.get(truth) else { return None };
         [(a, b), (b, a)].into_iter().find_map(|(size, side)| {
             let (limit, size, or_at) = match build.get(size) {
@@ -52,7 +52,7 @@ impl Beyond {
             let (Op::Abs(x), Op::Less(zero, product)) = (build.get(size), build.get(side)) else { return None };
             let Op::Mul(p, q) = build.get(product) else { return None };
             let rate = if p == x { q } else { p };
-            (build.constant(zero) == Some(0.0) && [p, q].contains(&x)).then_some(Beyond { limit, or_at, x, rate })
+            (build.constant(zero) == Some(0.0) && [p, q].contains(&x)).then_some(LimitTest { limit, or_at, x, rate })
         })
     }
 
@@ -67,20 +67,20 @@ impl Beyond {
 
 /// If `truth` is the second test of a limited integrator, returns an equal test that does not depend on the first.
 fn independent_second_test(build: &mut Build, truth: Value) -> Option<Value> {
-    let middle = Beyond::of(build, truth)?;
+    let middle = LimitTest::of(build, truth)?;
     let Op::Fma(a, b, x) = build.get(middle.x) else { return None };
     let (share, chosen) = if is_share_of_step(build, a) { (a, b) } else { (b, a) };
     let Op::Select(when, stopped, rate) = build.get(chosen) else { return None };
-    let first = Beyond { x, ..middle };
+    let first = LimitTest { x, ..middle };
     let matches = is_share_of_step(build, share)
         && rate == middle.rate
         && build.get(stopped) == Op::Real(0)
-        && Beyond::of(build, when)? == first;
+        && LimitTest::of(build, when)? == first;
     if !matches {
         return None;
     }
     let x = build.fma(share, rate, x);
-    Some(Beyond { x, ..middle }.build(build))
+    Some(LimitTest { x, ..middle }.build(build))
 }
 
 /// Whether a value is the step length, or the step length times a positive constant.

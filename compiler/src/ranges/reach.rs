@@ -87,14 +87,14 @@ impl<'a> Reach<'a> {
         let mut interval = self.find(id);
         if !self.ranges_only {
             for k in 0..self.requires.len() {
-                let said = self.by_ranges(|reach| reach.told(reach.requires[k], id));
+                let said = self.by_ranges(|reach| reach.implied_by(reach.requires[k], id));
                 let both = interval.and(said);
                 // Contradictory requirements are reported by the check of start values.
                 interval = if both.is_empty() { interval } else { both };
             }
             for k in 0..self.facts.len() {
                 let fact = self.facts[k];
-                interval = interval.and(self.elsewhere(|reach| reach.told(fact, id)));
+                interval = interval.and(self.elsewhere(|reach| reach.implied_by(fact, id)));
             }
         }
         self.known[depth].insert(id, interval);
@@ -232,14 +232,14 @@ impl<'a> Reach<'a> {
     }
 
     /// The interval of an expression that a fact implies.
-    fn told(&mut self, (condition, holds): Fact, id: ExprId) -> Interval {
+    fn implied_by(&mut self, (condition, holds): Fact, id: ExprId) -> Interval {
         match *self.system.node(condition) {
-            Node::Not(a) if planted::is("not is forgotten") => self.told((a, holds), id),
-            Node::Not(a) => self.told((a, !holds), id),
-            Node::Fits { value, .. } => self.told((value, holds), id),
-            Node::Var(var) => self.meaning(var).map_or(Interval::ALL, |value| self.told((value, holds), id)),
+            Node::Not(a) if planted::is("not is forgotten") => self.implied_by((a, holds), id),
+            Node::Not(a) => self.implied_by((a, !holds), id),
+            Node::Fits { value, .. } => self.implied_by((value, holds), id),
+            Node::Var(var) => self.meaning(var).map_or(Interval::ALL, |value| self.implied_by((value, holds), id)),
             Node::Binary(op @ (BinaryOp::And | BinaryOp::Or), a, b) => {
-                let (x, y) = (self.told((a, holds), id), self.told((b, holds), id));
+                let (x, y) = (self.implied_by((a, holds), id), self.implied_by((b, holds), id));
                 if holds == (op == BinaryOp::And) || planted::is("or is and") { x.and(y) } else { x.hull(y) }
             }
             Node::Binary(op, a, b) => {

@@ -4,13 +4,13 @@
 //! In: both programs and the plan. Out: warnings, and the inertia for the plan. Uses the approximate delay limit of
 //! docs/prediction.md; `fric predict` computes the limit from the compiled step.
 
-use super::Places;
+use super::RigSpans;
 use crate::analysis::linearise::{Linear, Matrices, PortSlots};
 use crate::ir::interpret::Interpreter;
 use crate::ir::program::Program;
 use abi::description::{Kind as QuantityKind, Quantity};
 use abi::format::{quantity, three_digits};
-use abi::rig::{Kind, Mode, Rig, Signal, What};
+use abi::rig::{Kind, Mode, Rig, Signal, SignalKind};
 use abi::series::Method;
 use abi::table::Code;
 use abi::unit::{Angle, Dimension, Unit};
@@ -47,15 +47,15 @@ pub fn linear(program: &Program, inputs: &[Slot], outputs: &[Slot]) -> Option<(M
 /// The moment of inertia that a torque accelerates, in kg·m², from the linearisation of the plant at its start. `None`
 /// if no torque is applied, or if it does not directly accelerate the measured speed.
 pub fn inertia(rig: &Rig, plant: &Program) -> Option<f64> {
-    let (_, torque) = rig.plant.applied.iter().find(|(signal, _)| signal.what == What::Torque)?;
-    let (_, speed) = rig.plant.seen.iter().find(|(signal, _)| signal.what == What::Speed)?;
+    let (_, torque) = rig.plant.applied.iter().find(|(signal, _)| signal.what == SignalKind::Torque)?;
+    let (_, speed) = rig.plant.seen.iter().find(|(signal, _)| signal.what == SignalKind::Speed)?;
     let (m, n) = linear(plant, &[*torque], &[*speed])?;
     let gain: f64 = (0..n).map(|i| m.c[i] * m.b[i]).sum();
     (gain != 0.0 && gain.is_finite()).then(|| 1.0 / gain.abs())
 }
 
 /// All warnings of a rig.
-pub fn check(rig: &Rig, control: &Program, plant: &Program, places: &Places) -> Vec<Diagnostic> {
+pub fn check(rig: &Rig, control: &Program, plant: &Program, places: &RigSpans) -> Vec<Diagnostic> {
     let mut found = Vec::new();
     emulation(rig, control, plant, places, &mut found);
     resolution(rig, control, places, &mut found);
@@ -65,7 +65,7 @@ pub fn check(rig: &Rig, control: &Program, plant: &Program, places: &Places) -> 
 
 /// Warns about drives with frames described by hand or by a DBC file: such descriptions cannot show that the drive
 /// stops when the computer fails.
-fn unproven(rig: &Rig, places: &Places, found: &mut Vec<Diagnostic>) {
+fn unproven(rig: &Rig, places: &RigSpans, found: &mut Vec<Diagnostic>) {
     for (k, node) in rig.nodes.iter().enumerate() {
         if node.moves && matches!(node.kind, Kind::Frames(_)) {
             let warning = Diagnostic::warning(
@@ -139,7 +139,7 @@ impl Emulated {
     }
 }
 
-fn emulation(rig: &Rig, control: &Program, plant: &Program, places: &Places, found: &mut Vec<Diagnostic>) {
+fn emulation(rig: &Rig, control: &Program, plant: &Program, places: &RigSpans, found: &mut Vec<Diagnostic>) {
     let Some(inertia) = rig.plant.inertia else { return };
     let period = rig.period_ns as f64 * 1e-9;
     for (k, output) in rig.outputs.iter().enumerate() {
@@ -185,7 +185,7 @@ fn emulation(rig: &Rig, control: &Program, plant: &Program, places: &Places, fou
 fn contact(rig: &Rig, control: &Program, plant: &Program, command: Signal, slot: Slot, tau: f64) -> Option<Contact> {
     // A contact responds to the speed; its integral acts as a spring. A response to the position is a controller.
     let speeds: Vec<Slot> =
-        rig.inputs.iter().filter(|input| input.signal.what == What::Speed).map(|input| input.slot).collect();
+        rig.inputs.iter().filter(|input| input.signal.what == SignalKind::Speed).map(|input| input.slot).collect();
     let (m, n) = linear(control, &speeds, &[slot])?;
     let width = speeds.len();
     let (mut stiffness, mut damping) = (0.0, 0.0);
@@ -197,17 +197,17 @@ fn contact(rig: &Rig, control: &Program, plant: &Program, command: Signal, slot:
     }
     // The sign with which this drive turns the measured shaft.
     let (_, torque) = rig.plant.applied.iter().find(|(signal, _)| *signal == command)?;
-    let (_, speed) = rig.plant.seen.iter().find(|(signal, _)| signal.what == What::Speed)?;
+    let (_, speed) = rig.plant.seen.iter().find(|(signal, _)| signal.what == SignalKind::Speed)?;
     let (p, states) = linear(plant, &[*torque], &[*speed])?;
     let gain: f64 = (0..states).map(|i| p.c[i] * p.b[i]).sum();
     let sign = if gain < 0.0 { -1.0 } else { 1.0 };
     Some(Contact { stiffness: sign * stiffness, damping: sign * damping })
 }
 
-fn resolution(rig: &Rig, control: &Program, places: &Places, found: &mut Vec<Diagnostic>) {
+fn resolution(rig: &Rig, control: &Program, places: &RigSpans, found: &mut Vec<Diagnostic>) {
     let quantities = &control.description.quantities;
     let shown = |value: f64, unit: &Unit| quantity(value, unit, 3);
-    let used = |what: What, node: usize| rig.inputs.iter().any(|input| input.signal == Signal { node, what });
+    let used = |what: SignalKind, node: usize| rig.inputs.iter().any(|input| input.signal == Signal { node, what });
     let params = |dimension: Dimension, angular: bool| {
         let all = quantities.iter().filter(move |q| {
             let plain = !q.unit.text.contains("/rad");
@@ -224,7 +224,7 @@ fn resolution(rig: &Rig, control: &Program, places: &Places, found: &mut Vec<Dia
     for (k, node) in rig.nodes.iter().enumerate() {
         let Kind::Cia402(drive) = &node.kind else { continue };
         let place = places.nodes.get(k).copied().unwrap_or(places.name);
-        let sees = used(What::Position, k) || used(What::Speed, k);
+        let sees = used(SignalKind::Position, k) || used(SignalKind::Speed, k);
         let narrow = quantities
             .iter()
             .filter(|q| q.kind == QuantityKind::State && q.unit.dimension.is_none() && q.unit.angle == Angle::Angle)
@@ -240,7 +240,7 @@ fn resolution(rig: &Rig, control: &Program, places: &Places, found: &mut Vec<Dia
                 format!("a count of at most {} shows it; or observe the shaft with a `part`", shown(most, &state.unit));
             found.push(warning.help(help));
         }
-        if let Some((param, value)) = params(SPEED, true).filter(|_| used(What::Speed, k))
+        if let Some((param, value)) = params(SPEED, true).filter(|_| used(SignalKind::Speed, k))
             && drive.speed_unit > SPEED_SHARE * value
         {
             let message = format!("the speed of `{}` is too coarse for `{}`", node.name, param.path);
@@ -252,7 +252,7 @@ fn resolution(rig: &Rig, control: &Program, places: &Places, found: &mut Vec<Dia
             );
             found.push(warning.help(help));
         }
-        let commanded = rig.outputs.iter().any(|output| output.signal == Signal { node: k, what: What::Torque });
+        let commanded = rig.outputs.iter().any(|output| output.signal == Signal { node: k, what: SignalKind::Torque });
         if let Some((param, value)) = params(TORQUE, false).filter(|_| commanded)
             && 1e-3 * drive.rated_torque > TORQUE_SHARE * value
         {

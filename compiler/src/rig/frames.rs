@@ -6,8 +6,8 @@
 //! more with a 29-bit identifier.
 
 use super::dbc;
-use super::nodes::{Description, Read, Speaks, format_of};
-use abi::rig::{Field, Kind, Message, Rig, What};
+use super::nodes::{Description, Protocol, SignalRef, format_of};
+use abi::rig::{Field, Kind, Message, Rig, SignalKind};
 use abi::unit::Unit;
 use grammar::diagnostic::Diagnostic;
 use grammar::span::{FileId, Span};
@@ -23,7 +23,7 @@ const FULL: f64 = 0.95;
 
 /// Messages of a node, and the location of each of its signals.
 #[derive(Default)]
-pub struct Laid {
+pub struct MessageLayout {
     /// Its messages.
     pub messages: Vec<Message>,
     /// For each signal described by hand: message and field.
@@ -31,9 +31,13 @@ pub struct Laid {
 }
 
 /// Lays out the messages of a device described by hand. `value`: the value of a hidden parameter by name.
-pub fn by_hand(description: &Description, value: &dyn Fn(&str) -> f64, diagnostics: &mut Vec<Diagnostic>) -> Laid {
-    let Speaks::Frames(signals) = &description.speaks else { return Laid::default() };
-    let mut laid = Laid::default();
+pub fn by_hand(
+    description: &Description,
+    value: &dyn Fn(&str) -> f64,
+    diagnostics: &mut Vec<Diagnostic>,
+) -> MessageLayout {
+    let Protocol::Frames(signals) = &description.protocol else { return MessageLayout::default() };
+    let mut laid = MessageLayout::default();
     for signal in signals {
         let name = &signal.name.text;
         let get = |what: &str| value(&format!("{name} {what}"));
@@ -100,8 +104,12 @@ pub fn by_hand(description: &Description, value: &dyn Fn(&str) -> f64, diagnosti
 }
 
 /// Lays out the messages of a DBC file. Messages with a commanded signal are sent.
-pub fn by_dbc(messages: &[dbc::Message], sent: &dyn Fn(usize) -> bool, diagnostics: &mut Vec<Diagnostic>) -> Laid {
-    let mut laid = Laid::default();
+pub fn by_dbc(
+    messages: &[dbc::Message],
+    sent: &dyn Fn(usize) -> bool,
+    diagnostics: &mut Vec<Diagnostic>,
+) -> MessageLayout {
+    let mut laid = MessageLayout::default();
     for (m, message) in messages.iter().enumerate() {
         let mut refuse = |span: Span, why: String| {
             diagnostics.push(Diagnostic::error("E0802", why).label(span, "in the DBC file"));
@@ -181,11 +189,11 @@ fn inside(signal: &dbc::Signal, length: u64) -> bool {
 }
 
 /// The location of a signal.
-pub fn what(read: Read, laid: &Laid) -> What {
+pub fn what(read: SignalRef, laid: &MessageLayout) -> SignalKind {
     match read {
-        Read::What(what) => what,
-        Read::Written(k) => laid.fields.get(k).map_or(What::Field(0, 0), |(m, f)| What::Field(*m, *f)),
-        Read::Field(m, f) => What::Field(m, f),
+        SignalRef::Cia402(what) => what,
+        SignalRef::Written(k) => laid.fields.get(k).map_or(SignalKind::Field(0, 0), |(m, f)| SignalKind::Field(*m, *f)),
+        SignalRef::Field(m, f) => SignalKind::Field(m, f),
     }
 }
 
@@ -292,10 +300,9 @@ pub fn load(rig: &Rig, bus: usize) -> f64 {
             Kind::Frames(messages) => messages,
         };
         for (m, message) in messages.iter().enumerate() {
-            let commanded = rig
-                .outputs
-                .iter()
-                .any(|output| output.signal.node == n && matches!(output.signal.what, What::Field(k, _) if k == m));
+            let commanded = rig.outputs.iter().any(|output| {
+                output.signal.node == n && matches!(output.signal.what, SignalKind::Field(k, _) if k == m)
+            });
             let every = match (message.send, message.period_ns) {
                 (_, ns) if ns > 0 => ns as f64 * 1e-9,
                 (true, _) if commanded && node.moves => period,

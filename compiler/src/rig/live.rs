@@ -12,16 +12,16 @@ use crate::frontend::source::Files;
 use crate::frontend::system::*;
 use crate::frontend::units::Types;
 use crate::ir::program::Program;
-use crate::lower::{self, Sought};
+use crate::lower::{self, ParamValue};
 use abi::Slot;
 use abi::description::Kind as QuantityKind;
-use abi::live::{Check, Live, Param, Place};
+use abi::live::{Check, Live, Param, Tunable};
 use abi::unit::Unit;
 
 /// Result of the analysis before the programs exist.
 #[derive(Clone)]
-pub struct Judged {
-    params: Vec<Known>,
+pub struct LiveChecks {
+    params: Vec<LiveParam>,
     checks: Vec<Check>,
     program: Program,
     /// Path of the part that hardware replaces.
@@ -29,7 +29,7 @@ pub struct Judged {
 }
 
 #[derive(Clone)]
-struct Known {
+struct LiveParam {
     path: String,
     unit: Unit,
     boolean: bool,
@@ -66,8 +66,8 @@ pub struct Fixed<'a> {
 }
 
 /// Analyses a system whose values have been checked.
-pub fn judged(system: &System, types: &Types, files: &Files, fixed: &Fixed) -> Judged {
-    let mut wanted = Wanted { all: Vec::new(), first: Slot::FIXED + lower::independent(system) };
+pub fn judged(system: &System, types: &Types, files: &Files, fixed: &Fixed) -> LiveChecks {
+    let mut wanted = JudgeValues { all: Vec::new(), first: Slot::FIXED + lower::independent(system) };
     let checks = conditions(system, types, files, fixed, &mut wanted);
     let (program, slots) = lower::of_params(system, types, &wanted.all);
     let (part, inside) = fixed.part;
@@ -107,42 +107,44 @@ pub fn judged(system: &System, types: &Types, files: &Files, fixed: &Fixed) -> J
     };
     // States are included, so that an attempt to set one is answered with the reason.
     let named = |id: &VarId| matches!(system.var(*id).kind, VarKind::Param | VarKind::State);
-    let params = system.var_ids().filter(named).map(|id| Known {
+    let params = system.var_ids().filter(named).map(|id| LiveParam {
         path: system.var(id).path.clone(),
         unit: types.units[id.0 as usize].clone(),
         boolean: types.boolean_vars[id.0 as usize],
         slot: slots.iter().find(|(own, _)| *own == id).map(|(_, slot)| *slot),
         start: why(id),
     });
-    Judged { params: params.collect(), checks, program, part: part.to_string() }
+    LiveChecks { params: params.collect(), checks, program, part: part.to_string() }
 }
 
 /// The values that the judge computes.
-struct Wanted {
-    all: Vec<Sought>,
+struct JudgeValues {
+    all: Vec<ParamValue>,
     /// Output slot of the first value.
     first: u32,
 }
 
-impl Wanted {
+impl JudgeValues {
     fn slot(&mut self, expr: ExprId) -> Slot {
-        self.one(Sought::Expr(expr))
+        self.one(ParamValue::Expr(expr))
     }
 
-    fn one(&mut self, sought: Sought) -> Slot {
+    fn one(&mut self, sought: ParamValue) -> Slot {
         self.all.push(sought);
         Slot(self.first + self.all.len() as u32 - 1)
     }
 }
 
 /// The conditions that a start checks, in the order of the start.
-fn conditions(system: &System, types: &Types, files: &Files, fixed: &Fixed, wanted: &mut Wanted) -> Vec<Check> {
+fn conditions(system: &System, types: &Types, files: &Files, fixed: &Fixed, wanted: &mut JudgeValues) -> Vec<Check> {
     let mut checks = Vec::new();
     for (id, unit) in system.var_ids().zip(&types.units) {
         let var = system.var(id);
         let value = match (&var.definition, var.kind) {
-            (Definition::Value(..), VarKind::Param | VarKind::Input) => Sought::Var(id),
-            (Definition::Continuous { initial, .. } | Definition::Sampled { initial, .. }, _) => Sought::Expr(*initial),
+            (Definition::Value(..), VarKind::Param | VarKind::Input) => ParamValue::Var(id),
+            (Definition::Continuous { initial, .. } | Definition::Sampled { initial, .. }, _) => {
+                ParamValue::Expr(*initial)
+            }
             _ => continue,
         };
         if var.range.low.is_none() && var.range.high.is_none() {
@@ -200,7 +202,7 @@ pub(super) fn reached(system: &System, exprs: &[ExprId]) -> Vec<bool> {
     vars
 }
 
-impl Judged {
+impl LiveChecks {
     /// Adds the slots of the control program. Also excludes parameters that only the start reads, and those that the
     /// plant reads.
     pub fn finish(self, control: &Program, plant: &Program) -> (Live, Program) {
@@ -213,8 +215,8 @@ impl Judged {
             let found = program.description.quantity(path).filter(|quantity| quantity.kind == QuantityKind::Param);
             found.map(|quantity| quantity.slot).filter(|slot| program.description.layout.params.contains(*slot))
         };
-        let place = |known: &Known| {
-            let start = |why: String| Place::Start(why);
+        let place = |known: &LiveParam| {
+            let start = |why: String| Tunable::Start(why);
             if let Some(why) = &known.start {
                 return start(why.clone());
             }
@@ -222,7 +224,7 @@ impl Judged {
                 return start(format!("`{}`, which the drives replace, depends on it", self.part));
             }
             match (param(control, &known.path), known.slot) {
-                (Some(slot), Some(judge)) if read.binary_search(&slot).is_ok() => Place::Live(slot, judge),
+                (Some(slot), Some(judge)) if read.binary_search(&slot).is_ok() => Tunable::Live(slot, judge),
                 (Some(slot), _) if at_start.contains(&slot) => start("only values at the start follow from it".into()),
                 _ => start("nothing on the rig reads it".into()),
             }

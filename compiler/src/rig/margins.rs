@@ -7,7 +7,7 @@
 use super::live::reached;
 use crate::frontend::system::*;
 use crate::ir::program::Program;
-use crate::lower::Wanted;
+use crate::lower::Observed;
 use abi::Slot;
 use abi::description::Guard;
 use abi::unit::{Angle, Dimension};
@@ -26,10 +26,10 @@ pub struct Margin {
 
 impl Margin {
     /// The expression to lower, with its name for messages.
-    pub fn wanted(&self) -> Wanted {
+    pub fn wanted(&self) -> Observed {
         let end = if self.high { "upper" } else { "lower" };
         let text = format!("distance of {} from its {end} bound", self.path);
-        Wanted { expr: self.room, text, unit: None }
+        Observed { expr: self.room, text, unit: None }
     }
 }
 

@@ -1,9 +1,9 @@
 //! Rigs: partitions a system into a control program and a plant, puts drives in the place of the part that hardware
 //! replaces, and performs all checks before anything moves.
 //!
-//! In: a rig's syntax tree. Out: a [`Cut`]: the plan of the rig and two flat systems. *Control* lacks the part;
-//! measurements of drives are its inputs, and their commands its outputs. *Plant* is the part alone, with the wires
-//! inverted. [`Cut::finish`] inserts the slots of both programs into the plan. Knows no files and no buses.
+//! In: a rig's syntax tree. Out: a [`PartitionedRig`]: the plan of the rig and two flat systems. *Control* lacks the
+//! part; measurements of drives are its inputs, and their commands its outputs. *Plant* is the part alone, with the wires
+//! inverted. [`PartitionedRig::finish`] inserts the slots of both programs into the plan. Knows no files and no buses.
 
 mod advice;
 mod partition;
@@ -18,25 +18,25 @@ mod step_derivative;
 mod wires;
 
 use crate::analysis::parameter_checks;
-use crate::frontend::flatten::{self, BusNode, Frame, Framed, Instance, Override, Scope, flatten};
+use crate::frontend::flatten::{self, BusNode, Frame, Instance, Override, RigFrame, Scope, flatten};
 use crate::frontend::resolve::{ItemRef, Loaded, Lookup, Space};
 use crate::frontend::source::{Files, Sources, Tree};
 use crate::frontend::system::*;
 use crate::frontend::units::Types;
 use crate::ir::program::Program;
-use crate::lower::{Wanted, evaluate};
+use crate::lower::{Observed, evaluate};
 use crate::pipeline::{Depth, analyse};
 use crate::rig::partition::{affine, lives, mentioned, nothing, one, pruned, solved};
 use abi::Slot;
 use abi::description::Kind as QuantityKind;
 use abi::live::{self as words, Live};
-use abi::rig::{self, Mode, Overrun, Rig, Signal, What};
+use abi::rig::{self, Mode, Overrun, Rig, Signal, SignalKind};
 use abi::series::{Method, Series};
 use abi::unit::{Dimension, Unit};
 use grammar::ast::{self, Expr, Item, Name};
 use grammar::diagnostic::Diagnostic;
 use grammar::span::{FileId, Span};
-use nodes::{Description, Read, Speaks};
+use nodes::{Description, Protocol, SignalRef};
 use statements::{Expressions, Statements};
 use std::sync::Arc;
 
@@ -48,7 +48,7 @@ pub use frames::{load as bus_load, of_dbc as dbc_messages};
 pub const PLANT_STEPS: u32 = 50;
 
 /// A rig with the descriptions of its drives and devices, which come from texts of their own.
-pub struct Prepared {
+pub struct LoadedRig {
     ast: Arc<Tree>,
     item: ItemRef,
     model: ast::Model,
@@ -56,7 +56,7 @@ pub struct Prepared {
     diagnostics: Vec<Diagnostic>,
 }
 
-impl Prepared {
+impl LoadedRig {
     /// The syntax tree of the rig.
     pub fn rig(&self) -> &ast::Rig {
         match self.ast.item(self.item.index) {
@@ -87,7 +87,7 @@ pub fn find(loaded: &Loaded, file: FileId, name: &Name) -> Result<ItemRef, Diagn
 }
 
 /// Reads the descriptions of a rig's drives and devices.
-pub fn prepare(loaded: &mut Loaded, sources: &dyn Sources, item: ItemRef) -> Prepared {
+pub fn prepare(loaded: &mut Loaded, sources: &dyn Sources, item: ItemRef) -> LoadedRig {
     let ast = loaded.files.get(item.file).ast.clone();
     let Item::Rig(rig) = ast.item(item.index) else { unreachable!("a rig was found here") };
     let mut diagnostics = Vec::new();
@@ -118,11 +118,11 @@ pub fn prepare(loaded: &mut Loaded, sources: &dyn Sources, item: ItemRef) -> Pre
         }
     }
     let model = ast::Model { name: rig.name.clone(), body, doc: rig.doc.clone(), span: rig.span };
-    Prepared { ast: ast.clone(), item, model, descriptions, diagnostics }
+    LoadedRig { ast: ast.clone(), item, model, descriptions, diagnostics }
 }
 
 /// A rig as two flat systems and a plan without slots.
-pub struct Cut {
+pub struct PartitionedRig {
     /// The system without the part that hardware replaces.
     pub control: System,
     /// Types of `control`.
@@ -145,9 +145,9 @@ pub struct Cut {
     applied: Vec<VarId>,
     seen: Vec<VarId>,
     seen_read: Vec<ExprId>,
-    judged: live::Judged,
+    judged: live::LiveChecks,
     /// Spans for messages about the rig.
-    pub places: Places,
+    pub places: RigSpans,
 }
 
 /// A rig as two programs and a plan.
@@ -166,7 +166,7 @@ pub struct Lowered {
 
 /// Spans of a rig for messages.
 #[derive(Clone, Default)]
-pub struct Places {
+pub struct RigSpans {
     /// The name of the rig.
     pub name: Span,
     /// The period.
@@ -188,12 +188,12 @@ pub struct Places {
 pub fn read<'a>(
     loaded: &'a Loaded,
     sources: &'a dyn Sources,
-    prepared: &'a Prepared,
+    prepared: &'a LoadedRig,
     overrides: Vec<Override<'a>>,
     observed: Vec<&'a Expr>,
     data: Vec<(String, Table, Unit)>,
     diagnostics: &mut Vec<Diagnostic>,
-) -> Option<Cut> {
+) -> Option<PartitionedRig> {
     diagnostics.extend(prepared.diagnostics.iter().cloned());
     let rig = prepared.rig();
     let misread = loaded.diagnostics.iter().any(|d| d.is_error() && within(rig.span, d.span()));
@@ -256,7 +256,7 @@ fn within(outer: Span, inner: Span) -> bool {
 
 /// Indices of the rig's expressions among all expressions of the frame.
 #[derive(Default)]
-struct Lists {
+struct ExprIndices {
     rate: usize,
     step: Option<usize>,
     watchdog: Option<usize>,
@@ -264,7 +264,7 @@ struct Lists {
     /// For each bus its bit rate.
     bit_rates: Vec<Option<usize>>,
     /// Commands.
-    sends: Vec<Send>,
+    sends: Vec<Command>,
     /// Outputs of the part: the wire in `hardware`, and its value.
     gives: Vec<(usize, usize)>,
     stops: Vec<usize>,
@@ -272,9 +272,9 @@ struct Lists {
 }
 
 /// `drive.signal = expr limit a .. b slew r`
-struct Send {
+struct Command {
     node: usize,
-    read: Read,
+    read: SignalRef,
     unit: Unit,
     /// Whether it is written inside `hardware`.
     inside: bool,
@@ -356,8 +356,8 @@ impl<'a> Reader<'a, '_> {
     }
 
     /// Collects all expressions that are read in the scope of the rig.
-    fn lists(&mut self) -> Lists {
-        let mut lists = Lists::default();
+    fn lists(&mut self) -> ExprIndices {
+        let mut lists = ExprIndices::default();
         let seconds = unit("s");
         if let Some((expr, span)) = self.statements.rate {
             lists.rate = self.expressions.constant(Scope::Rig, expr, "rate", seconds.clone(), span);
@@ -411,7 +411,7 @@ impl<'a> Reader<'a, '_> {
         lists
     }
 
-    fn send(&mut self, wire: &'a ast::Wire, inside: bool, lists: &mut Lists) {
+    fn send(&mut self, wire: &'a ast::Wire, inside: bool, lists: &mut ExprIndices) {
         let scope = if inside { Scope::Part } else { Scope::Rig };
         let [node, signal] = wire.path.segments.as_slice() else {
             let error = Diagnostic::error("E0204", "a command goes to a signal of a drive or device")
@@ -431,9 +431,9 @@ impl<'a> Reader<'a, '_> {
                 let message = format!("`{name}` of `{}` cannot be commanded", node.name.text);
                 let mut error = Diagnostic::error("E0204", message).label(signal.name.span, "no such command");
                 let near = crate::frontend::names::nearest(name, known.iter().map(String::as_str));
-                error = match (near, &description.speaks) {
+                error = match (near, &description.protocol) {
                     (Some(near), _) => error.help(format!("did you mean `{near}`?")),
-                    (None, Speaks::Cia402 { .. }) => {
+                    (None, Protocol::Cia402 { .. }) => {
                         error.help(format!("its `mode` says that it follows `{}`", known.join("")))
                     }
                     (None, _) if known.is_empty() => error.help("it only talks: nothing can be sent to it"),
@@ -460,10 +460,10 @@ impl<'a> Reader<'a, '_> {
         let slew = wire.slew.as_ref();
         let slew = slew.map(|slew| self.expressions.constant(scope, slew, "slew", per_second, declared));
         let (path, span) = (wire.path.span, wire.span);
-        lists.sends.push(Send { node: at, read, unit, inside, value, limit, slew, safe: None, path, span });
+        lists.sends.push(Command { node: at, read, unit, inside, value, limit, slew, safe: None, path, span });
     }
 
-    fn safe(&mut self, lists: &mut Lists) {
+    fn safe(&mut self, lists: &mut ExprIndices) {
         for (path, value) in &self.statements.safe {
             let text = self.files.slice(path.span);
             let found = match path.segments.as_slice() {
@@ -507,10 +507,10 @@ impl<'a> Reader<'a, '_> {
         &mut self,
         mut system: System,
         observed: Vec<ExprId>,
-        framed: Framed,
+        framed: RigFrame,
         expressions: Expressions,
-        lists: Lists,
-    ) -> Option<Cut> {
+        lists: ExprIndices,
+    ) -> Option<PartitionedRig> {
         let top_span = self.rig.span;
         let part = framed.hardware;
         let at = |number: usize| framed.expressions[number];
@@ -653,7 +653,8 @@ impl<'a> Reader<'a, '_> {
         let plan = self.plan(&system, &framed, &lists, &number, &param)?;
         let mut fielded = Vec::new();
         for (send, output) in lists.sends.iter().zip(&plan.outputs) {
-            let (rig::Kind::Frames(messages), What::Field(m, f)) = (&plan.nodes[send.node].kind, output.signal.what)
+            let (rig::Kind::Frames(messages), SignalKind::Field(m, f)) =
+                (&plan.nodes[send.node].kind, output.signal.what)
             else {
                 continue;
             };
@@ -689,7 +690,7 @@ impl<'a> Reader<'a, '_> {
                 commands: &fielded,
             },
         );
-        let places = Places {
+        let places = RigSpans {
             name: self.rig.name.span,
             rate: self.statements.rate.map_or(self.rig.name.span, |(expr, _)| expr.span),
             run: self.statements.run.map_or(self.rig.name.span, |run| run.instance.span),
@@ -702,7 +703,7 @@ impl<'a> Reader<'a, '_> {
             wires: lists.sends.iter().map(|send| send.span).collect(),
             allows: self.statements.allows.iter().map(|allow| allow.lint.text.clone()).collect(),
         };
-        let mut cut = Cut {
+        let mut cut = PartitionedRig {
             control,
             control_types,
             plant: plant.system,
@@ -771,7 +772,7 @@ impl<'a> Reader<'a, '_> {
 
     /// The observed condition of each `stop`. A condition with a crossing, which holds for an instant only, sets a
     /// state that keeps it.
-    fn latched(&mut self, system: &mut System, framed: &Framed, lists: &Lists) -> Vec<ExprId> {
+    fn latched(&mut self, system: &mut System, framed: &RigFrame, lists: &ExprIndices) -> Vec<ExprId> {
         let mut out = Vec::new();
         for stop in &lists.stops {
             let condition = framed.expressions[*stop];
@@ -810,7 +811,7 @@ fn has_crossing(system: &System, id: ExprId) -> bool {
 }
 
 /// `name = expr` of `hardware`.
-struct Give {
+struct PartOutput {
     var: VarId,
     value: usize,
     span: Span,

@@ -8,7 +8,7 @@ use super::dbc;
 use crate::frontend::names::nearest;
 use crate::frontend::resolve::{Loaded, Lookup, Space};
 use crate::frontend::source::Sources;
-use abi::rig::{Format, Mode, What};
+use abi::rig::{Format, Mode, SignalKind};
 use abi::unit::Unit;
 use grammar::ast::{self, BinaryOp, Declaration, DeclarationKind, Expr, ExprKind, Item, Name, UnitText};
 use grammar::diagnostic::Diagnostic;
@@ -58,11 +58,11 @@ pub struct Description {
     /// The instance with the arguments of the rig.
     pub instance: ast::Instance,
     /// Protocol of the node.
-    pub speaks: Speaks,
+    pub protocol: Protocol,
 }
 
 /// Protocol of a node.
-pub enum Speaks {
+pub enum Protocol {
     /// CANopen with the profile CiA 402.
     Cia402 {
         /// The commanded quantity.
@@ -81,50 +81,54 @@ pub enum Speaks {
 impl Description {
     /// The readable signals: name of the input, and which signal it is. A signal described by hand is identified by its
     /// index in the text, because its message is not known before identifiers are.
-    pub fn reads(&self) -> Vec<(&str, Read)> {
-        match &self.speaks {
-            Speaks::Cia402 { .. } => CIA402_SIGNALS.iter().map(|(name, what)| (*name, Read::What(*what))).collect(),
-            Speaks::Frames(signals) => {
-                let read = signals.iter().enumerate().filter(|(_, signal)| !signal.send);
-                read.map(|(k, signal)| (signal.name.text.as_str(), Read::Written(k))).collect()
+    pub fn reads(&self) -> Vec<(&str, SignalRef)> {
+        match &self.protocol {
+            Protocol::Cia402 { .. } => {
+                CIA402_SIGNALS.iter().map(|(name, what)| (*name, SignalRef::Cia402(*what))).collect()
             }
-            Speaks::Dbc(messages) => fields(messages).map(|(m, f, s)| (s.name.as_str(), Read::Field(m, f))).collect(),
+            Protocol::Frames(signals) => {
+                let read = signals.iter().enumerate().filter(|(_, signal)| !signal.send);
+                read.map(|(k, signal)| (signal.name.text.as_str(), SignalRef::Written(k))).collect()
+            }
+            Protocol::Dbc(messages) => {
+                fields(messages).map(|(m, f, s)| (s.name.as_str(), SignalRef::Field(m, f))).collect()
+            }
         }
     }
 
     /// Unit, identity and span of a signal that can be commanded.
     ///
     /// # Errors The names of all signals that can be commanded.
-    pub fn sends(&self, name: &str) -> Result<(Option<Unit>, Read, Span), Vec<String>> {
-        match &self.speaks {
-            Speaks::Cia402 { mode, .. } => {
+    pub fn sends(&self, name: &str) -> Result<(Option<Unit>, SignalRef, Span), Vec<String>> {
+        match &self.protocol {
+            Protocol::Cia402 { mode, .. } => {
                 let (text, unit, what) = match mode {
-                    Mode::Torque => ("torque", "N·m", What::Torque),
-                    Mode::Speed => ("speed", "rad/s", What::Speed),
-                    Mode::Position => ("position", "rad", What::Position),
+                    Mode::Torque => ("torque", "N·m", SignalKind::Torque),
+                    Mode::Speed => ("speed", "rad/s", SignalKind::Speed),
+                    Mode::Position => ("position", "rad", SignalKind::Position),
                 };
                 match name == text {
-                    true => Ok((Unit::parse(unit).ok(), Read::What(what), self.name.span)),
+                    true => Ok((Unit::parse(unit).ok(), SignalRef::Cia402(what), self.name.span)),
                     false => Err(vec![text.into()]),
                 }
             }
-            Speaks::Frames(signals) => {
+            Protocol::Frames(signals) => {
                 let sent = signals.iter().enumerate().filter(|(_, signal)| signal.send);
                 let mut names = Vec::new();
                 for (k, signal) in sent {
                     if signal.name.text == name {
                         let unit = signal.unit.as_ref().and_then(|unit| Unit::parse(&unit.text).ok());
-                        return Ok((Some(unit.unwrap_or_default()), Read::Written(k), signal.name.span));
+                        return Ok((Some(unit.unwrap_or_default()), SignalRef::Written(k), signal.name.span));
                     }
                     names.push(signal.name.text.clone());
                 }
                 Err(names)
             }
-            Speaks::Dbc(messages) => {
+            Protocol::Dbc(messages) => {
                 let found = fields(messages).find(|(_, _, signal)| signal.name == name);
                 match found {
                     Some((m, f, signal)) => {
-                        Ok((Some(signal.unit.clone().unwrap_or_default()), Read::Field(m, f), signal.span))
+                        Ok((Some(signal.unit.clone().unwrap_or_default()), SignalRef::Field(m, f), signal.span))
                     }
                     None => Err(fields(messages).map(|(_, _, signal)| signal.name.clone()).collect()),
                 }
@@ -135,22 +139,22 @@ impl Description {
 
 /// Identity of a signal before identifiers are known.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
-pub enum Read {
+pub enum SignalRef {
     /// A CiA 402 signal.
-    What(What),
+    Cia402(SignalKind),
     /// The signal of this index in a description by hand.
     Written(usize),
     /// Message and field of a DBC file.
     Field(usize, usize),
 }
 
-const CIA402_SIGNALS: [(&str, What); 6] = [
-    ("torque", What::Torque),
-    ("speed", What::Speed),
-    ("position", What::Position),
-    ("enabled_bit", What::Enabled),
-    ("fault_bit", What::Fault),
-    ("limited_bit", What::Limited),
+const CIA402_SIGNALS: [(&str, SignalKind); 6] = [
+    ("torque", SignalKind::Torque),
+    ("speed", SignalKind::Speed),
+    ("position", SignalKind::Position),
+    ("enabled_bit", SignalKind::Enabled),
+    ("fault_bit", SignalKind::Fault),
+    ("limited_bit", SignalKind::Limited),
 ];
 
 fn fields(messages: &[dbc::Message]) -> impl Iterator<Item = (usize, usize, &dbc::Signal)> {
@@ -264,9 +268,9 @@ impl Describer<'_> {
             let error = Diagnostic::error("E0203", message).label(statement.kind.span, "`mode` is not given");
             self.diagnostics.push(error.help("add `mode = torque`, `mode = speed` or `mode = position`"));
         }
-        let speaks =
-            Speaks::Cia402 { mode: mode.unwrap_or(Mode::Torque), at_sync, profile: statement.kind.text.clone() };
-        described(statement, model, file, args, speaks)
+        let protocol =
+            Protocol::Cia402 { mode: mode.unwrap_or(Mode::Torque), at_sync, profile: statement.kind.text.clone() };
+        described(statement, model, file, args, protocol)
     }
 
     fn no_range(&mut self, name: &Name, span: Span) {
@@ -334,13 +338,13 @@ impl Describer<'_> {
                 ast::DriveArg::Range(low, high) => self.no_range(name, low.span.to(high.span)),
             }
         }
-        let (body, speaks) = match &device.body {
+        let (body, protocol) = match &device.body {
             ast::DeviceBody::Frames { params, frames } => {
-                (self.by_hand(params, frames), Speaks::Frames(frames.clone()))
+                (self.by_hand(params, frames), Protocol::Frames(frames.clone()))
             }
             ast::DeviceBody::Dbc { file: path, messages } => {
                 let messages = self.messages(home, path, messages, files)?;
-                (self.by_dbc(&messages), Speaks::Dbc(messages))
+                (self.by_dbc(&messages), Protocol::Dbc(messages))
             }
         };
         let mut body: Vec<ast::Statement> = body.into_iter().map(ast::Statement::Declaration).collect();
@@ -374,7 +378,7 @@ impl Describer<'_> {
         }
         let model = ast::Model { name: device.name.clone(), body, doc: device.doc.clone(), span: device.span };
         self.no_signals(&model, &args, statement);
-        Some(described(statement, model, home, args, speaks))
+        Some(described(statement, model, home, args, protocol))
     }
 
     /// Parameters as written, followed by the position and format of each signal as hidden parameters, whose names
@@ -518,10 +522,10 @@ fn described(
     model: ast::Model,
     file: FileId,
     args: Vec<ast::Bind>,
-    speaks: Speaks,
+    protocol: Protocol,
 ) -> Description {
     let instance = ast::Instance { rotary: false, model: statement.kind.clone(), args, span: statement.kind.span };
-    Description { name: statement.name.clone(), statement: statement.clone(), model, file, instance, speaks }
+    Description { name: statement.name.clone(), statement: statement.clone(), model, file, instance, protocol }
 }
 
 fn bind(name: &str, span: Span, value: &Expr) -> ast::Bind {

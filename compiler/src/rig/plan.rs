@@ -7,15 +7,15 @@ use super::margins::{self, Margin};
 use super::*;
 use crate::ir::program::Program;
 use crate::lower::{self, lower};
-use frames::{Laid, OnBus};
+use frames::{MessageLayout, OnBus};
 
 impl Reader<'_, '_> {
     /// Everything of the plan except signals and slots.
     pub(super) fn plan(
         &mut self,
         system: &System,
-        framed: &Framed,
-        lists: &Lists,
+        framed: &RigFrame,
+        lists: &ExprIndices,
         number: &dyn Fn(usize) -> f64,
         param: &dyn Fn(usize, &str) -> f64,
     ) -> Option<Rig> {
@@ -57,9 +57,9 @@ impl Reader<'_, '_> {
             nodes.push(node);
             laid_out.push(laid);
         }
-        let signal = |send: &Send| Signal { node: send.node, what: frames::what(send.read, &laid_out[send.node]) };
+        let signal = |send: &Command| Signal { node: send.node, what: frames::what(send.read, &laid_out[send.node]) };
         for send in &lists.sends {
-            if let What::Field(m, f) = signal(send).what
+            if let SignalKind::Field(m, f) = signal(send).what
                 && let rig::Kind::Frames(messages) = &nodes[send.node].kind
             {
                 debug_assert!(messages[m].fields.len() > f, "a field that was laid out");
@@ -118,7 +118,7 @@ impl Reader<'_, '_> {
         (self.errors() == before).then_some(plan)
     }
 
-    fn period(&mut self, lists: &Lists, number: &dyn Fn(usize) -> f64) -> (u64, u32) {
+    fn period(&mut self, lists: &ExprIndices, number: &dyn Fn(usize) -> f64) -> (u64, u32) {
         let value = number(lists.rate);
         let span = self.statements.rate.map_or(self.rig.name.span, |(expr, _)| expr.span);
         if !(20e-6..=1.0).contains(&value) {
@@ -172,7 +172,7 @@ impl Reader<'_, '_> {
         }
     }
 
-    fn buses(&mut self, lists: &Lists, number: &dyn Fn(usize) -> f64) -> Vec<rig::Bus> {
+    fn buses(&mut self, lists: &ExprIndices, number: &dyn Fn(usize) -> f64) -> Vec<rig::Bus> {
         let mut out = Vec::new();
         for (bus, rate) in self.statements.buses.iter().zip(&lists.bit_rates) {
             let text = bus.args.iter().find_map(|arg| match arg {
@@ -217,10 +217,10 @@ impl Reader<'_, '_> {
         &mut self,
         k: usize,
         description: &Description,
-        lists: &Lists,
+        lists: &ExprIndices,
         param: &dyn Fn(&str) -> f64,
         period_ns: u64,
-    ) -> Option<(rig::Node, Laid)> {
+    ) -> Option<(rig::Node, MessageLayout)> {
         let statement = &description.statement;
         let bus = self.statements.buses.iter().position(|bus| bus.name.text == statement.bus.text);
         if bus.is_none() {
@@ -235,8 +235,8 @@ impl Reader<'_, '_> {
         }
         let finite = |value: f64| value.is_finite().then_some(value);
         let mut timeout_ns = nanoseconds(param("timeout"));
-        let (kind, laid) = match &description.speaks {
-            Speaks::Cia402 { mode, at_sync, profile } => {
+        let (kind, laid) = match &description.protocol {
+            Protocol::Cia402 { mode, at_sync, profile } => {
                 let node = param("node");
                 if node.fract() != 0.0 {
                     let error = Diagnostic::error("E0502", format!("node {node} is no whole number"))
@@ -260,19 +260,19 @@ impl Reader<'_, '_> {
                     at_sync: *at_sync,
                     profile: profile.clone(),
                 };
-                (rig::Kind::Cia402(drive), Laid::default())
+                (rig::Kind::Cia402(drive), MessageLayout::default())
             }
-            Speaks::Frames(_) => {
+            Protocol::Frames(_) => {
                 let mut laid = frames::by_hand(description, param, self.diagnostics);
                 let messages = std::mem::take(&mut laid.messages);
                 (rig::Kind::Frames(messages), laid)
             }
-            Speaks::Dbc(messages) => {
+            Protocol::Dbc(messages) => {
                 let sent = |m: usize| {
                     lists
                         .sends
                         .iter()
-                        .any(|send| send.node == k && matches!(send.read, Read::Field(other, _) if other == m))
+                        .any(|send| send.node == k && matches!(send.read, SignalRef::Field(other, _) if other == m))
                 };
                 let mut laid = frames::by_dbc(messages, &sent, self.diagnostics);
                 let messages = std::mem::take(&mut laid.messages);
@@ -284,12 +284,12 @@ impl Reader<'_, '_> {
                 .label(statement.kind.span, format!("{} s", param("delay")));
             self.report(error.help("a command that acts so late drives nothing: is the unit right?"));
         }
-        let framed = statement.moves && !matches!(description.speaks, Speaks::Cia402 { .. });
+        let framed = statement.moves && !matches!(description.protocol, Protocol::Cia402 { .. });
         let within = match framed {
-            false => rig::Within::default(),
+            false => rig::DriveLimits::default(),
             true => {
                 let travel = (param("travel_low"), param("travel_high"));
-                rig::Within {
+                rig::DriveLimits {
                     max_speed: finite(param("speed_max")),
                     travel: (travel.0.is_finite() || travel.1.is_finite()).then_some(travel),
                     max_power: finite(param("power_max")),
@@ -311,7 +311,7 @@ impl Reader<'_, '_> {
 
     fn output(
         &mut self,
-        send: &Send,
+        send: &Command,
         signal: Signal,
         nodes: &[rig::Node],
         number: &dyn Fn(usize) -> f64,
@@ -327,14 +327,14 @@ impl Reader<'_, '_> {
         };
         // The narrowest representation that the command must fit.
         let (carried, because) = match (&node.kind, signal.what) {
-            (rig::Kind::Cia402(drive), What::Torque) => {
+            (rig::Kind::Cia402(drive), SignalKind::Torque) => {
                 let by_message = 32.767 * drive.rated_torque;
                 match drive.max_torque {
                     Some(most) if most < by_message => ((-most, most), format!("`T_max` is {}", shown(most))),
                     _ => ((-by_message, by_message), "16 bits of a thousandth of `T_rated`".into()),
                 }
             }
-            (rig::Kind::Cia402(drive), What::Speed) => {
+            (rig::Kind::Cia402(drive), SignalKind::Speed) => {
                 let by_message = f64::from(i32::MAX) * drive.speed_unit;
                 match drive.max_speed {
                     Some(most) if most < by_message => ((-most, most), format!("`speed_max` is {}", shown(most))),
@@ -346,7 +346,7 @@ impl Reader<'_, '_> {
                 let travel = drive.travel.unwrap_or((f64::NEG_INFINITY, f64::INFINITY));
                 ((travel.0.max(-by_message), travel.1.min(by_message)), "`travel`, or 32 bits of `count`".into())
             }
-            (rig::Kind::Frames(messages), What::Field(m, f)) => {
+            (rig::Kind::Frames(messages), SignalKind::Field(m, f)) => {
                 let field = &messages[m].fields[f];
                 (frames::carries(field), format!("{} bits of {}", field.bits, shown(field.scale)))
             }
@@ -382,7 +382,7 @@ impl Reader<'_, '_> {
         rig::Output { signal, slot: Slot(0), low, high, slew, safe }
     }
 
-    fn predict(&mut self, lists: &Lists, nodes: &[rig::Node]) -> Option<usize> {
+    fn predict(&mut self, lists: &ExprIndices, nodes: &[rig::Node]) -> Option<usize> {
         let (name, _) = self.statements.predict?;
         let Some(at) = self.node(&name.text) else {
             self.no_node(name, "drive");
@@ -401,10 +401,10 @@ impl Reader<'_, '_> {
     /// The signals that the control program reads, and whether each must be fresh.
     pub(super) fn signals(
         &mut self,
-        cut: &mut Cut,
+        cut: &mut PartitionedRig,
         system: &System,
-        framed: &Framed,
-        gives: &[Give],
+        framed: &RigFrame,
+        gives: &[PartOutput],
         at: &dyn Fn(usize) -> ExprId,
     ) {
         let mut from: Vec<ExprId> = gives.iter().map(|give| at(give.value)).collect();
@@ -432,7 +432,7 @@ impl Reader<'_, '_> {
                     self.report(error.help("add `timeout = 100 ms`, or what the device keeps to"));
                 }
                 if node.moves
-                    && matches!(signal.what, What::Speed | What::Position | What::Field(..))
+                    && matches!(signal.what, SignalKind::Speed | SignalKind::Position | SignalKind::Field(..))
                     && !cut.seen.contains(&id)
                     && !cut.applied.contains(&id)
                 {
@@ -444,7 +444,7 @@ impl Reader<'_, '_> {
                 }
                 self.unit_of_dbc(description, read, used, &cut.control);
                 let start = match (&node.kind, signal.what) {
-                    (rig::Kind::Frames(messages), What::Field(m, f)) => messages[m].fields[f].start,
+                    (rig::Kind::Frames(messages), SignalKind::Field(m, f)) => messages[m].fields[f].start,
                     _ => 0.0,
                 };
                 cut.rig.inputs.push(rig::Input { signal, slot: Slot(0), start, needed });
@@ -461,7 +461,7 @@ impl Reader<'_, '_> {
             match (read, command) {
                 (Some(read), _) => Signal { node, what: frames::what(read, &laid) },
                 (None, Some(k)) => cut.rig.outputs[k].signal,
-                (None, None) => Signal { node, what: What::Torque },
+                (None, None) => Signal { node, what: SignalKind::Torque },
             }
         };
         let applied: Vec<(Signal, Slot)> = cut.applied.iter().map(|id| (of(id), Slot(0))).collect();
@@ -471,21 +471,21 @@ impl Reader<'_, '_> {
     }
 
     /// The location of the signals of a description by hand.
-    fn laid_fields(&self, node: &rig::Node, description: &Description) -> Laid {
-        let (rig::Kind::Frames(messages), Speaks::Frames(signals)) = (&node.kind, &description.speaks) else {
-            return Laid::default();
+    fn laid_fields(&self, node: &rig::Node, description: &Description) -> MessageLayout {
+        let (rig::Kind::Frames(messages), Protocol::Frames(signals)) = (&node.kind, &description.protocol) else {
+            return MessageLayout::default();
         };
         let place = |name: &str| {
             let mut all = messages.iter().enumerate();
             all.find_map(|(m, message)| Some((m, message.fields.iter().position(|field| field.name == name)?)))
         };
         let fields = signals.iter().map(|signal| place(&signal.name.text).unwrap_or((0, 0))).collect();
-        Laid { messages: Vec::new(), fields }
+        MessageLayout { messages: Vec::new(), fields }
     }
 
     /// W0806: a signal of a DBC file with an unknown unit.
-    fn unit_of_dbc(&mut self, description: &Description, read: Read, used: ExprId, control: &System) {
-        let (Speaks::Dbc(messages), Read::Field(m, f)) = (&description.speaks, read) else { return };
+    fn unit_of_dbc(&mut self, description: &Description, read: SignalRef, used: ExprId, control: &System) {
+        let (Protocol::Dbc(messages), SignalRef::Field(m, f)) = (&description.protocol, read) else { return };
         let signal = &messages[m].signals[f];
         // A switch or a flag needs no unit.
         if signal.unit.is_some() || signal.unit_text.is_empty() && signal.bits == 1 {
@@ -502,7 +502,7 @@ impl Reader<'_, '_> {
     }
 
     /// Recorded quantities, each in its unit.
-    pub(super) fn shows(&mut self, cut: &mut Cut) {
+    pub(super) fn shows(&mut self, cut: &mut PartitionedRig) {
         for (show, expr) in self.statements.records.iter().zip(cut.records.clone()) {
             let boolean = cut.control_types.boolean[expr.0 as usize];
             let dimension = cut.control_types.nodes[expr.0 as usize].unwrap_or(Dimension::NONE);
@@ -535,22 +535,25 @@ impl Reader<'_, '_> {
     }
 }
 
-impl Cut {
+impl PartitionedRig {
     /// The outputs of the control program; they precede those that an experiment requests.
-    pub fn wanted(&self, control: &System) -> Vec<Wanted> {
+    pub fn wanted(&self, control: &System) -> Vec<Observed> {
         let commands = self.outputs.iter().zip(&self.commands_read);
         let commands = commands.map(|(id, read)| (*read, control.var(*id).path.clone()));
         let stops = self.stops.iter().zip(&self.rig.stops).map(|(expr, stop)| (*expr, stop.condition.clone()));
         let records = self.records.iter().zip(&self.rig.record).map(|(expr, series)| (*expr, series.label.clone()));
         let all = commands.chain(stops).chain(records);
-        let all = all.map(|(expr, text)| Wanted { expr, text, unit: None });
+        let all = all.map(|(expr, text)| Observed { expr, text, unit: None });
         all.chain(self.margins.iter().map(Margin::wanted)).collect()
     }
 
     /// The outputs of the plant program.
-    pub fn wanted_of_plant(&self) -> Vec<Wanted> {
-        let one =
-            |(id, read): (&VarId, &ExprId)| Wanted { expr: *read, text: self.plant.var(*id).path.clone(), unit: None };
+    pub fn wanted_of_plant(&self) -> Vec<Observed> {
+        let one = |(id, read): (&VarId, &ExprId)| Observed {
+            expr: *read,
+            text: self.plant.var(*id).path.clone(),
+            unit: None,
+        };
         self.seen.iter().zip(&self.seen_read).map(one).collect()
     }
 
@@ -646,10 +649,10 @@ impl Cut {
 }
 
 /// Whether a quantity of a drive is bounded only by the message format.
-fn because_of_message(node: &rig::Node, what: What) -> bool {
+fn because_of_message(node: &rig::Node, what: SignalKind) -> bool {
     match (&node.kind, what) {
-        (rig::Kind::Cia402(drive), What::Torque) => drive.max_torque.is_none(),
-        (rig::Kind::Cia402(drive), What::Speed) => drive.max_speed.is_none(),
+        (rig::Kind::Cia402(drive), SignalKind::Torque) => drive.max_torque.is_none(),
+        (rig::Kind::Cia402(drive), SignalKind::Speed) => drive.max_speed.is_none(),
         (rig::Kind::Cia402(drive), _) => drive.travel.is_none(),
         (rig::Kind::Frames(_), _) => false,
     }

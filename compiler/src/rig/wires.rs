@@ -9,9 +9,15 @@ use super::*;
 
 impl Reader<'_, '_> {
     /// The quantities of the part that wires define.
-    pub(super) fn gives(&mut self, system: &mut System, framed: &Framed, lists: &Lists, part: InstanceId) -> Vec<Give> {
+    pub(super) fn gives(
+        &mut self,
+        system: &mut System,
+        framed: &RigFrame,
+        lists: &ExprIndices,
+        part: InstanceId,
+    ) -> Vec<PartOutput> {
         let Some(hardware) = self.statements.hardware else { return Vec::new() };
-        let mut out: Vec<Give> = Vec::new();
+        let mut out: Vec<PartOutput> = Vec::new();
         for (wire, value) in &lists.gives {
             let wire = &hardware.wires[*wire];
             let name = &wire.path.segments[0].name;
@@ -66,13 +72,13 @@ impl Reader<'_, '_> {
                 self.report(error.help("read drives and devices here, or a `part` of the rig that observes them"));
                 continue;
             }
-            out.push(Give { var: found, value: *value, span: wire.path.span });
+            out.push(PartOutput { var: found, value: *value, span: wire.path.span });
         }
         out
     }
 
     /// Checks that every input of the part is sent to a drive, and that every drive has a command.
-    pub(super) fn unsent(&mut self, system: &System, framed: &Framed, lists: &Lists, part: InstanceId) {
+    pub(super) fn unsent(&mut self, system: &System, framed: &RigFrame, lists: &ExprIndices, part: InstanceId) {
         let Some(hardware) = self.statements.hardware else { return };
         let inputs: Vec<VarId> = system
             .var_ids()
@@ -158,10 +164,10 @@ impl Reader<'_, '_> {
     pub(super) fn plant(
         &mut self,
         system: &System,
-        framed: &Framed,
-        lists: &Lists,
+        framed: &RigFrame,
+        lists: &ExprIndices,
         commands: &[VarId],
-        gives: &[Give],
+        gives: &[PartOutput],
         of_part: &dyn Fn(&System, VarId) -> bool,
     ) -> Option<PlantSystem> {
         let mut plant = system.clone();
@@ -262,7 +268,7 @@ impl Reader<'_, '_> {
     }
 
     /// The quantity that a drive applies: its own measurement of the command, or for a device a quantity of its own.
-    fn applied_signal(&mut self, plant: &mut System, framed: &Framed, send: &Send, command: VarId) -> VarId {
+    fn applied_signal(&mut self, plant: &mut System, framed: &RigFrame, send: &Command, command: VarId) -> VarId {
         let node = framed.nodes[send.node];
         let name = self.files.slice(send.path).rsplit('.').next().unwrap_or_default().trim().to_string();
         let own = plant.var_ids().find(|id| {
@@ -282,11 +288,11 @@ impl Reader<'_, '_> {
 
     /// All drives of one rig turn the same shaft: speed and position without a wire equal those of the drive that has
     /// them.
-    fn same_shaft(&mut self, plant: &mut System, framed: &Framed, seen: &mut Vec<VarId>, applied: &[VarId]) {
+    fn same_shaft(&mut self, plant: &mut System, framed: &RigFrame, seen: &mut Vec<VarId>, applied: &[VarId]) {
         for name in ["speed", "position"] {
             let Some(known) = seen.iter().copied().find(|id| plant.var(*id).name == name) else { continue };
             for (k, node) in self.descriptions.iter().enumerate() {
-                if !matches!(node.speaks, Speaks::Cia402 { .. }) {
+                if !matches!(node.protocol, Protocol::Cia402 { .. }) {
                     continue;
                 }
                 let mine = plant.var_ids().find(|id| {

@@ -14,7 +14,7 @@
 
 use crate::coupling::lag::Lag;
 use abi::Instance;
-use abi::rig::{Kind, Rig, Signal, What};
+use abi::rig::{Kind, Rig, Signal, SignalKind};
 
 /// Short steps of the observer per period, and of the prediction.
 const STEPS: u64 = 32;
@@ -109,7 +109,7 @@ impl Wired {
         let Some(emulating) = drive(node) else { return Err("`predict` names a drive that is none".into()) };
         let torque = |k: &usize| {
             let signal = rig.outputs[*k].signal;
-            signal.what == What::Torque && rig.plant.applied.iter().any(|(applied, _)| *applied == signal)
+            signal.what == SignalKind::Torque && rig.plant.applied.iter().any(|(applied, _)| *applied == signal)
         };
         let mut outputs: Vec<usize> = (0..rig.outputs.len()).filter(torque).collect();
         outputs.sort_by_key(|k| rig.outputs[*k].signal.node != node);
@@ -130,7 +130,7 @@ impl Wired {
             (k, sign(rig, plant, signal, node), step)
         };
         let outputs = outputs.into_iter().map(wired).collect();
-        Ok(Some(Wired { lookahead, position: Signal { node, what: What::Position }, outputs, node }))
+        Ok(Some(Wired { lookahead, position: Signal { node, what: SignalKind::Position }, outputs, node }))
     }
 
     /// Passes the permitted outputs to the observer, one value per output of the rig, rounded as the drives receive
@@ -154,7 +154,7 @@ impl Wired {
 
 /// Sign with which a torque accelerates the shaft at a drive, determined by one short step of the plant.
 pub(crate) fn sign(rig: &Rig, plant: &Instance, torque: Signal, node: usize) -> f64 {
-    let speed = rig.plant.seen.iter().find(|(signal, _)| *signal == Signal { node, what: What::Speed });
+    let speed = rig.plant.seen.iter().find(|(signal, _)| *signal == Signal { node, what: SignalKind::Speed });
     let applied = rig.plant.applied.iter().find(|(signal, _)| *signal == torque);
     let (Some((_, speed)), Some((_, applied))) = (speed, applied) else { return 1.0 };
     let mut turned = [0.0, 0.0];

@@ -10,7 +10,7 @@ use crate::coupling::predictor::Wired;
 use crate::run::observe::{Observer, check_finite, check_status};
 use crate::run::outcome::{Cause, Continue, Stop, Work};
 use abi::plan::Experiment;
-use abi::rig::{Bench, Field, Format, Kind, Rig, Signal, What};
+use abi::rig::{Bench, Field, Format, Kind, Rig, Signal, SignalKind};
 use abi::{Instance, Slot};
 
 /// Path of a command from the control program to the plant.
@@ -70,10 +70,10 @@ pub(crate) fn run(
         Ahead { wired: Wired::of(rig, &bench.plant, |_| 0).map_err(unable)?, seen: None, speed: None, position: None };
     if let Some(wired) = &look.wired {
         let slot = |what| rig.plant.seen.iter().find(|(signal, _)| *signal == Signal { node: wired.node, what });
-        look.seen = slot(What::Position).map(|(signal, slot)| (*slot, step_of_signal(rig, *signal)));
+        look.seen = slot(SignalKind::Position).map(|(signal, slot)| (*slot, step_of_signal(rig, *signal)));
         let input = |what| rig.inputs.iter().find(|input| input.signal == Signal { node: wired.node, what });
-        look.speed = input(What::Speed).map(|input| input.slot);
-        look.position = input(What::Position).map(|input| input.slot);
+        look.speed = input(SignalKind::Speed).map(|input| input.slot);
+        look.position = input(SignalKind::Position).map(|input| input.slot);
     }
 
     let status = plant.start(period / steps as f64);
@@ -194,10 +194,10 @@ fn step_of(field: &Field) -> f64 {
 /// Quantisation step of a signal on the bus, SI.
 fn step_of_signal(rig: &Rig, signal: Signal) -> f64 {
     match (&rig.nodes[signal.node].kind, signal.what) {
-        (Kind::Cia402(drive), What::Torque) => 1e-3 * drive.rated_torque,
-        (Kind::Cia402(drive), What::Speed) => drive.speed_unit,
-        (Kind::Cia402(drive), What::Position) => drive.count,
-        (Kind::Frames(messages), What::Field(m, f)) => step_of(&messages[m].fields[f]),
+        (Kind::Cia402(drive), SignalKind::Torque) => 1e-3 * drive.rated_torque,
+        (Kind::Cia402(drive), SignalKind::Speed) => drive.speed_unit,
+        (Kind::Cia402(drive), SignalKind::Position) => drive.count,
+        (Kind::Frames(messages), SignalKind::Field(m, f)) => step_of(&messages[m].fields[f]),
         _ => 0.0,
     }
 }
@@ -229,9 +229,9 @@ fn readings(rig: &Rig, paths: &[Path]) -> Vec<Sensed> {
         let applied = paths.iter().position(|path| path.signal == input.signal);
         let step = step_of_signal(rig, input.signal);
         let from = match (seen, applied, input.signal.what) {
-            (Some((_, slot)), _, what) => From::Part(*slot, step, what == What::Position && step > 0.0),
+            (Some((_, slot)), _, what) => From::Part(*slot, step, what == SignalKind::Position && step > 0.0),
             (None, Some(path), _) => From::Applied(path, step),
-            (None, None, What::Enabled) => From::Constant(1.0),
+            (None, None, SignalKind::Enabled) => From::Constant(1.0),
             (None, None, _) => From::Constant(input.start),
         };
         Sensed { to: input.slot, from }

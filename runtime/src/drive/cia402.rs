@@ -14,7 +14,7 @@ use crate::canopen::{NmtState, Object, Send, Type};
 use crate::drive::faults::{Reading, RefusalReason, TroubleKind};
 use crate::drive::sdo_sequence::{Entry, Keep, Progress, Question, Script, Watching};
 use crate::safety::{Protection, is_present};
-use abi::rig::{Cia402, Mode, What};
+use abi::rig::{Cia402, Mode, SignalKind};
 
 const STATUS: Object = Object(0x6041, 0);
 const CONTROL: Object = Object(0x6040, 0);
@@ -534,7 +534,7 @@ impl Drive {
     }
 
     /// A signal of the drive; none if it has no such signal.
-    pub fn reading(&self, what: What) -> Option<Reading> {
+    pub fn reading(&self, what: SignalKind) -> Option<Reading> {
         let at = |place: Option<Place>, value: f64| {
             place.map(|place| {
                 let answer = &self.answers[place.answer];
@@ -543,13 +543,13 @@ impl Drive {
         };
         let bit = |on: bool| at(Some(self.status_at), f64::from(u8::from(on)));
         match what {
-            What::Torque => at(self.torque_at, self.torque.value(self.torque_now)),
-            What::Speed => at(self.speed_at, self.speed.value(self.speed_now)),
-            What::Position => at(self.position_at, self.counter.total() as f64 * self.config.count),
-            What::Enabled => bit(self.following()),
-            What::Fault => bit(matches!(self.state(), State::Fault | State::FaultReaction)),
-            What::Limited => bit(self.word.unwrap_or(0) & status::LIMIT != 0),
-            What::Field(..) => None,
+            SignalKind::Torque => at(self.torque_at, self.torque.value(self.torque_now)),
+            SignalKind::Speed => at(self.speed_at, self.speed.value(self.speed_now)),
+            SignalKind::Position => at(self.position_at, self.counter.total() as f64 * self.config.count),
+            SignalKind::Enabled => bit(self.following()),
+            SignalKind::Fault => bit(matches!(self.state(), State::Fault | State::FaultReaction)),
+            SignalKind::Limited => bit(self.word.unwrap_or(0) & status::LIMIT != 0),
+            SignalKind::Field(..) => None,
         }
     }
 

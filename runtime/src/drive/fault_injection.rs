@@ -3,7 +3,7 @@
 //! In: `load fault 0x2310 at 3 s`, `panel.enable = 0 at 5 s`, `servo encoder frozen when servo.speed > 10 rad/s for 20
 //! ms`. Out: a [`Hook`].
 
-use abi::rig::{Kind, Rig, Signal, What};
+use abi::rig::{Kind, Rig, Signal, SignalKind};
 use abi::unit::Unit;
 
 /// Fault of a simulated node.
@@ -119,7 +119,7 @@ pub fn read(text: &str, rig: &Rig) -> Result<Hook, String> {
     let (node, effect) = match what.split_once('=') {
         Some((signal, value)) => {
             let signal = signal_of(signal.trim(), rig).map_err(&wrong)?;
-            let What::Field(message, field) = signal.what else {
+            let SignalKind::Field(message, field) = signal.what else {
                 return Err(wrong("only signals of devices can be set; a drive measures its own".to_string()));
             };
             let Kind::Frames(messages) = &rig.nodes[signal.node].kind else { unreachable!("a field has frames") };
@@ -150,15 +150,15 @@ fn signal_of(text: &str, rig: &Rig) -> Result<Signal, String> {
     let node = node_of(name, rig)?;
     let what = match &rig.nodes[node].kind {
         Kind::Cia402(_) => match signal {
-            "torque" => What::Torque,
-            "speed" => What::Speed,
-            "position" => What::Position,
+            "torque" => SignalKind::Torque,
+            "speed" => SignalKind::Speed,
+            "position" => SignalKind::Position,
             _ => return Err(format!("a drive has torque, speed and position, no `{signal}`")),
         },
         Kind::Frames(messages) => {
             let place = messages.iter().enumerate().find_map(|(at, message)| {
                 let field = message.fields.iter().position(|field| field.name == signal)?;
-                Some(What::Field(at, field))
+                Some(SignalKind::Field(at, field))
             });
             place.ok_or_else(|| format!("`{name}` has no signal `{signal}`"))?
         }

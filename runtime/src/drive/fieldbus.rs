@@ -16,7 +16,7 @@ use crate::drive::faults::{Reading, Refusal, RefusalReason, Trouble, TroubleKind
 use crate::drive::polarity_check::{Bounds, PATIENCE, PATIENCE_BY_HAND, Push, Sample, SignTest, Verdict};
 use crate::drive::sdo_sequence::Watching;
 use crate::safety::{Protection, is_present};
-use abi::rig::{Kind, Mode, Rig, Signal, What};
+use abi::rig::{Kind, Mode, Rig, Signal, SignalKind};
 use std::fmt;
 
 /// Options of the start-up.
@@ -242,7 +242,7 @@ impl Fieldbus {
                 Kind::Frames(messages) => {
                     let safe: Vec<_> = outputs()
                         .filter_map(|output| match output.signal.what {
-                            What::Field(message, field) => Some((message, field, output.safe)),
+                            SignalKind::Field(message, field) => Some((message, field, output.safe)),
                             _ => None,
                         })
                         .collect();
@@ -367,7 +367,7 @@ impl Fieldbus {
     pub fn reading(&self, signal: Signal) -> Reading {
         let reading = match (&self.nodes[signal.node], signal.what) {
             (Node::Drive(drive), what) => drive.reading(what),
-            (Node::Device(device), What::Field(message, field)) => device.reading(message, field),
+            (Node::Device(device), SignalKind::Field(message, field)) => device.reading(message, field),
             (Node::Device(_), _) => None,
         };
         reading.unwrap_or_else(|| panic!("`{}` has no signal {:?}", self.names[signal.node], signal.what))
@@ -377,7 +377,7 @@ impl Fieldbus {
     pub fn has(&self, signal: Signal) -> bool {
         match (&self.nodes[signal.node], signal.what) {
             (Node::Drive(drive), what) => drive.reading(what).is_some(),
-            (Node::Device(device), What::Field(message, field)) => device.reading(message, field).is_some(),
+            (Node::Device(device), SignalKind::Field(message, field)) => device.reading(message, field).is_some(),
             (Node::Device(_), _) => false,
         }
     }
@@ -386,7 +386,7 @@ impl Fieldbus {
     pub fn command(&mut self, signal: Signal, value: f64) {
         match (&mut self.nodes[signal.node], signal.what) {
             (Node::Drive(drive), _) => drive.command(value),
-            (Node::Device(device), What::Field(message, field)) => device.command(message, field, value),
+            (Node::Device(device), SignalKind::Field(message, field)) => device.command(message, field, value),
             (Node::Device(_), _) => {}
         }
     }
@@ -396,7 +396,7 @@ impl Fieldbus {
     pub fn wanted(&self, signal: Signal) -> f64 {
         match (&self.nodes[signal.node], signal.what) {
             (Node::Drive(_), _) => self.wanted[signal.node],
-            (Node::Device(device), What::Field(message, field)) => device.safe(message, field),
+            (Node::Device(device), SignalKind::Field(message, field)) => device.safe(message, field),
             (Node::Device(_), _) => 0.0,
         }
     }
@@ -827,7 +827,7 @@ impl Fieldbus {
                 return;
             }
             let drive = drive_of(&self.nodes[at]).expect("found as one");
-            if drive.reading(What::Position).is_none() {
+            if drive.reading(SignalKind::Position).is_none() {
                 // Without a position there is nothing to compare: the operator must check the direction of this drive.
                 self.done[at] = true;
                 return;
@@ -881,7 +881,11 @@ impl Fieldbus {
 /// The readings of a drive for the polarity check.
 fn sample(drive: &Drive) -> Sample {
     let value = |what| drive.reading(what).map(|reading| reading.value);
-    Sample { position: value(What::Position).unwrap_or(0.0), speed: value(What::Speed), torque: value(What::Torque) }
+    Sample {
+        position: value(SignalKind::Position).unwrap_or(0.0),
+        speed: value(SignalKind::Speed),
+        torque: value(SignalKind::Torque),
+    }
 }
 
 /// Limits of a drive's polarity check.

@@ -12,7 +12,7 @@ use crate::can::Frame;
 use crate::drive::fault_injection::{Effect, Hook, Start};
 use crate::rng::Chance;
 use abi::Instance;
-use abi::rig::{Kind, Message, Rig, Signal, What};
+use abi::rig::{Kind, Message, Rig, Signal, SignalKind};
 
 /// Callback for the frames of nodes: the node (an index into the rig's nodes) and the frame.
 pub type Speak<'a> = &'a mut dyn FnMut(usize, Frame);
@@ -152,7 +152,9 @@ impl Bench {
             rig.plant.seen.iter().find(|(seen, _)| *seen == signal).map(|(_, slot)| *slot)
         };
         let holds = |node| {
-            let held = |signal: &Signal| signal.node == node && matches!(signal.what, What::Speed | What::Position);
+            let held = |signal: &Signal| {
+                signal.node == node && matches!(signal.what, SignalKind::Speed | SignalKind::Position)
+            };
             rig.plant.applied.iter().any(|(signal, _)| held(signal))
         };
         let mut bench = Bench {
@@ -160,13 +162,15 @@ impl Bench {
             shafts: vec![Shaft::default(); bodies.len()],
             bodies,
             applied: rig.plant.applied.iter().map(link).collect(),
-            seen: (0..rig.nodes.len()).map(|node| (seen(node, What::Position), seen(node, What::Speed))).collect(),
+            seen: (0..rig.nodes.len())
+                .map(|node| (seen(node, SignalKind::Position), seen(node, SignalKind::Speed)))
+                .collect(),
             holds: (0..rig.nodes.len()).map(holds).collect(),
             felt: rig
                 .plant
                 .seen
                 .iter()
-                .filter(|(signal, _)| matches!(signal.what, What::Field(..)))
+                .filter(|(signal, _)| matches!(signal.what, SignalKind::Field(..)))
                 .map(link)
                 .collect(),
             plant,
@@ -302,11 +306,11 @@ impl Bench {
                     Start::When { signal, above, level } => {
                         let shaft = self.shafts[signal.node];
                         let value = match signal.what {
-                            What::Torque => shaft.torque,
-                            What::Speed => shaft.speed,
-                            What::Position => shaft.position,
-                            What::Enabled | What::Fault | What::Limited => 0.0,
-                            What::Field(message, field) => self.value(signal.node, message, field).unwrap_or(0.0),
+                            SignalKind::Torque => shaft.torque,
+                            SignalKind::Speed => shaft.speed,
+                            SignalKind::Position => shaft.position,
+                            SignalKind::Enabled | SignalKind::Fault | SignalKind::Limited => 0.0,
+                            SignalKind::Field(message, field) => self.value(signal.node, message, field).unwrap_or(0.0),
                         };
                         if above { value > level } else { value < level }
                     }
@@ -343,12 +347,12 @@ impl Bench {
             Some(plant) => {
                 for link in &self.applied {
                     let value = match (&self.bodies[link.signal.node], link.signal.what) {
-                        (Body::Drive(drive), What::Torque) => drive.applied(),
-                        (Body::Drive(drive), What::Speed) => drive.speed(),
-                        (Body::Drive(drive), What::Position) => {
+                        (Body::Drive(drive), SignalKind::Torque) => drive.applied(),
+                        (Body::Drive(drive), SignalKind::Speed) => drive.speed(),
+                        (Body::Drive(drive), SignalKind::Position) => {
                             self.shafts[link.signal.node].position + drive.speed() * h
                         }
-                        (Body::Device(device), What::Field(message, field)) => {
+                        (Body::Device(device), SignalKind::Field(message, field)) => {
                             let held = plant.get(link.slot);
                             held + (device.values[message][field] - held) * device.share(h)
                         }
@@ -397,7 +401,7 @@ impl Bench {
             }
         }
         for link in &self.felt {
-            if let (Body::Device(device), What::Field(message, field)) =
+            if let (Body::Device(device), SignalKind::Field(message, field)) =
                 (&mut self.bodies[link.signal.node], link.signal.what)
                 && !device.stuck.contains(&(message, field))
             {

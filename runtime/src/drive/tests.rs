@@ -8,7 +8,7 @@ use crate::canopen::object::Entry;
 use crate::canopen::{Access, NmtState, Object, Service, Type};
 use crate::drive::fault_injection::{self, Hook};
 use crate::testing::drives::*;
-use abi::rig::{Kind, Mode, Rig, What};
+use abi::rig::{Kind, Mode, Rig, SignalKind};
 
 fn table(rig: &Rig) -> Table {
     Table::new(rig, Some(shaft(0.012, 0.001)), Options::default())
@@ -96,13 +96,13 @@ fn armed_the_shaft_follows_the_torque() {
     let gained = table.bench.shaft(LOAD).speed - before;
     // 0.5 N·m on 0.012 kg·m² for 0.1 s less half a period, dead time and lag: 0.0981 s.
     assert!((gained - 0.5 / 0.012 * 0.0981).abs() < 0.05, "{gained}");
-    let told = table.value(LOAD, What::Speed);
+    let told = table.value(LOAD, SignalKind::Speed);
     assert!((told - table.bench.shaft(LOAD).speed).abs() < 0.1, "{told}");
-    assert!((table.value(SERVO, What::Torque) - 0.5).abs() < 0.003);
-    assert_eq!(table.value(LOAD, What::Torque), 0.0);
-    let turned = table.value(LOAD, What::Position) - table.value(SERVO, What::Position);
+    assert!((table.value(SERVO, SignalKind::Torque) - 0.5).abs() < 0.003);
+    assert_eq!(table.value(LOAD, SignalKind::Torque), 0.0);
+    let turned = table.value(LOAD, SignalKind::Position) - table.value(SERVO, SignalKind::Position);
     assert!(turned.abs() < 1e-3, "both count from enabling: {turned}");
-    assert_eq!((table.value(LOAD, What::Enabled), table.value(LOAD, What::Fault)), (1.0, 0.0));
+    assert_eq!((table.value(LOAD, SignalKind::Enabled), table.value(LOAD, SignalKind::Fault)), (1.0, 0.0));
     // It stops on command.
     table.fieldbus.request(Request::QuickStop);
     table.ticks(100);
@@ -146,7 +146,7 @@ fn speed_and_position_are_controlled() {
 
     let mut position = speed.clone();
     config(&mut position, 0).mode = Mode::Position;
-    position.outputs[0].signal.what = What::Position;
+    position.outputs[0].signal.what = SignalKind::Position;
     let mut held = table(&position);
     held.arm();
     let before = held.bench.shaft(0).position;
@@ -357,10 +357,10 @@ fn faults_are_reported_in_time() {
     // Missing answers are detected by their age alone.
     let (kinds, _, table) = after("load no answers");
     assert_eq!(kinds, []);
-    let reading = table.fieldbus.reading(abi::rig::Signal { node: LOAD, what: What::Torque });
+    let reading = table.fieldbus.reading(abi::rig::Signal { node: LOAD, what: SignalKind::Torque });
     assert_eq!(reading.age, 100);
     let (.., table) = after("load encoder frozen");
-    assert_eq!(table.fieldbus.reading(abi::rig::Signal { node: LOAD, what: What::Position }).age, 0);
+    assert_eq!(table.fieldbus.reading(abi::rig::Signal { node: LOAD, what: SignalKind::Position }).age, 0);
 }
 
 #[test]
@@ -413,7 +413,7 @@ fn a_device_is_read_and_commanded() {
     let rig = rig(Mode::Torque);
     let mut table = table(&rig);
     table.bench.hook(fault_injection::read("panel.enable = 0 at 500 ms for 100 ms", &rig).unwrap());
-    let enable = abi::rig::Signal { node: PANEL, what: What::Field(0, 0) };
+    let enable = abi::rig::Signal { node: PANEL, what: SignalKind::Field(0, 0) };
     assert_eq!(table.fieldbus.reading(enable).age, Reading::NEVER);
     table.ticks(499);
     assert_eq!(table.fieldbus.reading(enable).value, 1.0);
@@ -462,7 +462,7 @@ fn a_simulated_vlt_has_its_scale_and_refresh() {
     table.ticks(20);
     let told = table.log.iter().rev().find(|(_, ours, frame)| *ours && frame.id() == 0x204).unwrap().2;
     assert_eq!(told.data(), [0x0F, 0, 0x00, 0x20], "half of 0x4000");
-    assert!((table.value(SERVO, What::Torque) - 2.0).abs() < 0.01);
+    assert!((table.value(SERVO, SignalKind::Torque) - 2.0).abs() < 0.01);
     // Its answers change only in every other tick.
     let speeds: Vec<_> = table
         .log
@@ -504,7 +504,7 @@ fn hooks_are_parsed_or_refused_with_a_message() {
     let read = |text: &str| fault_injection::read(text, &rig);
     let hook = read("servo encoder frozen when load.speed > 10 rad/s for 20 ms").unwrap();
     assert_eq!((hook.node, hook.effect, hook.lasts_ns), (SERVO, Effect::EncoderFrozen, Some(20_000_000)));
-    let signal = abi::rig::Signal { node: LOAD, what: What::Speed };
+    let signal = abi::rig::Signal { node: LOAD, what: SignalKind::Speed };
     assert_eq!(hook.start, Start::When { signal, above: true, level: 10.0 });
     assert_eq!(read("load answers late 2 ms at 1 s").unwrap().effect, Effect::AnswersLate(2_000_000));
     for (text, word) in [
@@ -574,7 +574,7 @@ fn two_drives_start_up_over_a_bus() {
 fn a_speed_drive_turns_a_torque_drive_for_its_polarity_check() {
     let mut rig = rig(Mode::Torque);
     config(&mut rig, SERVO).mode = Mode::Speed;
-    rig.outputs[SERVO].signal.what = What::Speed;
+    rig.outputs[SERVO].signal.what = SignalKind::Speed;
     (rig.outputs[LOAD].low, rig.outputs[LOAD].high) = (-1.0, 1.0);
     table(&rig).arm();
     let mut table = table(&rig);

@@ -17,7 +17,7 @@ use crate::safety::Cause;
 use crate::testing::generated::{self, changed, hold, seeds};
 use crate::testing::models::Model;
 use crate::testing::rigs;
-use abi::rig::{Kind, Rig, Signal, What};
+use abi::rig::{Kind, Rig, Signal, SignalKind};
 use abi::{Function, Instance};
 use std::collections::VecDeque;
 use std::f64::consts::TAU;
@@ -261,7 +261,7 @@ fn run(script: &Script) -> Result<Shown, String> {
         let (node, effect, start) = (0, Effect::EncoderLost(counts), Start::At(event_ns));
         world.bench().hook(Hook { node, effect, start, lasts_ns: None });
     }
-    let speed_slot = rig.inputs.iter().find(|input| input.signal == Signal { node: 0, what: What::Speed });
+    let speed_slot = rig.inputs.iter().find(|input| input.signal == Signal { node: 0, what: SignalKind::Speed });
     let speed_slot = speed_slot.expect("the contact reads the speed of its drive").slot;
     let Kind::Cia402(load) = &rig.nodes[0].kind else { unreachable!("the load is a drive") };
     let count = load.count;

@@ -10,7 +10,7 @@ use super::watches::{self, Bounds, bounds_of};
 use crate::coupling::predictor::Wired;
 use crate::drive::profiles;
 use crate::safety::{Cause, DriveCommand, Measured, Protection, Supervisor, Timeouts, is_present};
-use abi::rig::{Kind, Overrun, Rig, Signal, What};
+use abi::rig::{Kind, Overrun, Rig, Signal, SignalKind};
 use abi::{Instance, Slot};
 
 /// A value with its age.
@@ -271,8 +271,8 @@ impl Control {
                 return at;
             }
             let jump = match (&node.kind, signal.what) {
-                (Kind::Cia402(drive), What::Speed) => acceleration * period + 4.0 * drive.speed_unit,
-                (Kind::Cia402(drive), What::Position) => {
+                (Kind::Cia402(drive), SignalKind::Speed) => acceleration * period + 4.0 * drive.speed_unit,
+                (Kind::Cia402(drive), SignalKind::Position) => {
                     let speed = moving.iter().position(|i| *i == signal.node).map(|i| drives[i].speed);
                     2.0 * speed.unwrap_or(f64::INFINITY) * period + 4.0 * drive.count
                 }
@@ -300,8 +300,8 @@ impl Control {
             let needed = matches!(rig.nodes[*node].kind, Kind::Cia402(_)) || rig.nodes[*node].timeout_ns > 0;
             let mut measured =
                 |what| watches::measured_signal(rig, *node, what).map(|signal| watch(signal, 0.0, needed));
-            measured(What::Torque);
-            (measured(What::Speed), measured(What::Position))
+            measured(SignalKind::Torque);
+            (measured(SignalKind::Speed), measured(SignalKind::Position))
         });
         let seen_at: Vec<_> = seen_at.collect();
         let regimes = model.description().layout.regimes;
@@ -555,8 +555,10 @@ impl Control {
         if let (Some(ahead), Some(node)) = (ahead, self.coupling.looks_ahead()) {
             for (at, slot) in &self.inputs {
                 match self.watched[*at].signal {
-                    Signal { node: from, what: What::Speed } if from == node => self.model.set(*slot, ahead.speed),
-                    Signal { node: from, what: What::Position } if from == node => {
+                    Signal { node: from, what: SignalKind::Speed } if from == node => {
+                        self.model.set(*slot, ahead.speed)
+                    }
+                    Signal { node: from, what: SignalKind::Position } if from == node => {
                         self.model.set(*slot, ahead.position)
                     }
                     _ => {}
@@ -694,7 +696,7 @@ mod tests {
             Way { control, readings }
         }
 
-        fn set(&mut self, what: What, value: f64) {
+        fn set(&mut self, what: SignalKind, value: f64) {
             let at = self.control.signals().position(|signal| signal.what == what).unwrap();
             self.readings[at].value = value;
         }
@@ -702,12 +704,12 @@ mod tests {
         /// One cycle; the position follows the speed while the speed is plausible. Returns the permitted output.
         fn cycle(&mut self, ticks: u32, set: &[(Slot, f64)]) -> f64 {
             let at = |what| self.control.signals().position(|signal| signal.what == what).unwrap();
-            let (speed, position) = (self.readings[at(What::Speed)], at(What::Position));
+            let (speed, position) = (self.readings[at(SignalKind::Speed)], at(SignalKind::Position));
             if speed.value.abs() < 100.0 {
                 self.readings[position].value += speed.value * 1e-3 * f64::from(ticks);
             }
             // The drive applies its commanded torque.
-            let torque = at(What::Torque);
+            let torque = at(SignalKind::Torque);
             self.readings[torque].value = self.control.supervisor().permitted()[0];
             let (source, wanted, causes) = (Source::Model, &[][..], &[][..]);
             let told = CycleInputs { ticks, late_ns: 0, readings: &self.readings, source, wanted, causes, set };
@@ -719,7 +721,7 @@ mod tests {
     #[test]
     fn the_model_steps_over_the_coming_period_with_the_newest_readings() {
         let mut way = Way::new(|_| ());
-        way.set(What::Speed, 2.0);
+        way.set(SignalKind::Speed, 2.0);
         // A spring of 10 N·m/rad on the angle, which is the integral of 2 rad/s after k periods.
         for k in 1..=5 {
             let torque = way.cycle(1, &[]);
@@ -730,7 +732,7 @@ mod tests {
     #[test]
     fn missed_ticks_are_compensated_and_too_many_stop_the_rig() {
         let mut way = Way::new(|rig| rig.overrun = Overrun::Hold(2));
-        way.set(What::Speed, 2.0);
+        way.set(SignalKind::Speed, 2.0);
         way.cycle(1, &[]);
         let torque = way.cycle(3, &[]);
         assert!((torque + 10.0 * 2.0 * 4e-3).abs() < 1e-12, "{torque}");
@@ -762,9 +764,9 @@ mod tests {
     fn an_infinite_reading_is_rejected() {
         for bad in [f64::INFINITY, f64::NEG_INFINITY, f64::NAN] {
             let mut way = Way::new(|_| ());
-            way.set(What::Speed, 1.0);
+            way.set(SignalKind::Speed, 1.0);
             way.cycle(1, &[]);
-            let at = way.control.signals().position(|signal| signal.what == What::Torque).unwrap();
+            let at = way.control.signals().position(|signal| signal.what == SignalKind::Torque).unwrap();
             for cycle in 1..=3 {
                 assert_eq!(way.control.supervisor().cause(), None, "cycle {cycle}");
                 way.readings[at].value = bad;
@@ -796,7 +798,7 @@ mod tests {
         };
         let (name, fields) = ("force".to_string(), vec![field]);
         let message = Message { name, id: 0x1A0, extended: false, length: 4, send: false, period_ns: 0, fields };
-        let (kind, signal) = (Kind::Frames(vec![message]), Signal { node: 1, what: What::Field(0, 0) });
+        let (kind, signal) = (Kind::Frames(vec![message]), Signal { node: 1, what: SignalKind::Field(0, 0) });
         rig.nodes.push(Node { kind, moves: false, timeout_ns, ..rigs::drive("sensor", 9) });
         let input = rig.inputs[0];
         rig.inputs.push(Input { signal, ..input });
@@ -830,7 +832,7 @@ mod tests {
                 }
                 // The drive applies its commanded torque.
                 let torque = control.supervisor().permitted()[0];
-                let value = |signal: Signal| if signal.what == What::Torque { torque } else { 0.0 };
+                let value = |signal: Signal| if signal.what == SignalKind::Torque { torque } else { 0.0 };
                 let reading = |signal| Reading { value: value(signal), age: 0 };
                 let mut readings: Vec<Reading> = control.signals().map(reading).collect();
                 readings[at] = Reading { value: newest, age };
@@ -864,7 +866,7 @@ mod tests {
     #[test]
     fn a_missing_reading_is_held_and_then_counts_as_lost() {
         let mut way = Way::new(|_| ());
-        way.set(What::Speed, 1.0);
+        way.set(SignalKind::Speed, 1.0);
         way.cycle(1, &[]);
         for age in 1..3 {
             way.readings.iter_mut().for_each(|reading| *reading = Reading { value: 1.0, age });
@@ -879,10 +881,10 @@ mod tests {
     #[test]
     fn a_glitch_is_rejected_and_three_in_a_row_stop_the_rig() {
         let mut way = Way::new(|_| ());
-        way.set(What::Speed, 1.0);
+        way.set(SignalKind::Speed, 1.0);
         let held = way.cycle(1, &[]);
         for (cycle, cause) in [(1, None), (2, None), (3, Some(()))] {
-            way.set(What::Speed, 900.0);
+            way.set(SignalKind::Speed, 900.0);
             let torque = way.cycle(1, &[]);
             assert!((torque - held * f64::from(cycle + 1)).abs() < 1e-12 || cause.is_some(), "the old speed counts");
             assert_eq!(way.control.supervisor().cause().map(|_| ()), cause, "cycle {cycle}");
@@ -947,9 +949,9 @@ mod tests {
     #[test]
     fn a_second_of_implausible_readings_is_tolerated_if_overruns_are_only_counted() {
         let mut way = Way::of(|_| (), Options { count_overruns: true, ..Options::default() });
-        way.set(What::Speed, 1.0);
+        way.set(SignalKind::Speed, 1.0);
         way.cycle(1, &[]);
-        way.set(What::Speed, f64::NAN);
+        way.set(SignalKind::Speed, f64::NAN);
         for cycle in 1..1000 {
             way.cycle(1, &[]);
             assert_eq!(way.control.supervisor().cause(), None, "cycle {cycle}");
@@ -961,7 +963,7 @@ mod tests {
     #[test]
     fn a_set_of_parameters_causes_no_step_in_the_output() {
         let mut way = Way::new(|_| ());
-        way.set(What::Speed, 1.0);
+        way.set(SignalKind::Speed, 1.0);
         for _ in 0..10 {
             way.cycle(1, &[]);
         }
@@ -982,7 +984,7 @@ mod tests {
     #[test]
     fn a_set_with_which_the_model_cannot_continue_is_refused() {
         let mut way = Way::new(|_| ());
-        way.set(What::Speed, 1.0);
+        way.set(SignalKind::Speed, 1.0);
         let first = way.cycle(1, &[]);
         let stiffness = way.control.model().description().layout.params.slot(0);
         let second = way.cycle(1, &[(stiffness, f64::NAN)]);
@@ -993,7 +995,7 @@ mod tests {
     #[test]
     fn a_failure_of_the_model_stops_the_rig() {
         let mut way = Way::new(|_| ());
-        way.set(What::Speed, 1.0);
+        way.set(SignalKind::Speed, 1.0);
         way.cycle(1, &[]);
         let state = way.control.model.description().layout.states.slot(0);
         way.control.model.set(state, f64::NAN);
@@ -1017,7 +1019,7 @@ mod tests {
     fn what_is_saved_goes_on_as_before() {
         let mut first = Way::new(|_| ());
         for k in 0..50 {
-            first.set(What::Speed, f64::from(k % 5) * 0.1);
+            first.set(SignalKind::Speed, f64::from(k % 5) * 0.1);
             let mut words = Vec::new();
             first.control.save(&mut words);
             let mut second = Way::new(|_| ());

@@ -7,7 +7,7 @@
 use crate::coupling::passivity::{Energy, Sign};
 use crate::coupling::predictor::{Ahead, Wired};
 use crate::safety::{Protection, is_present};
-use abi::rig::{Kind, Mode, Rig, Signal, What};
+use abi::rig::{Kind, Mode, Rig, Signal, SignalKind};
 use abi::{Instance, Slot};
 
 /// A reading: its value, and whether it arrived in this cycle.
@@ -52,7 +52,7 @@ pub struct Contact {
 /// only the contact of that drive. `model`: the control program before its start.
 pub fn contacts(rig: &Rig, model: &Instance) -> Vec<Contact> {
     let speeds: Vec<Slot> =
-        rig.inputs.iter().filter(|input| input.signal.what == What::Speed).map(|input| input.slot).collect();
+        rig.inputs.iter().filter(|input| input.signal.what == SignalKind::Speed).map(|input| input.slot).collect();
     let found = rig.outputs.iter().enumerate().filter_map(|(at, output)| {
         let node = output.signal.node;
         let Kind::Cia402(drive) = &rig.nodes[node].kind else { return None };
@@ -96,15 +96,15 @@ impl Coupling {
     pub fn new(rig: &Rig, look: Option<Wired>, watched: &[Signal], model: &Instance) -> Coupling {
         let at = |signal: Signal| watched.iter().position(|other| *other == signal);
         let torques: Vec<usize> =
-            (0..rig.nodes.len()).filter_map(|node| at(Signal { node, what: What::Torque })).collect();
+            (0..rig.nodes.len()).filter_map(|node| at(Signal { node, what: SignalKind::Torque })).collect();
         let watch = |contact: Contact| {
             let node = rig.outputs[contact.output].signal.node;
             // Greatest energy that the contact can store.
             let store = 0.5 * contact.most * contact.most / contact.stiffness;
             Some(Watched {
                 energy: Energy::new(store, rig.period_ns as f64 * 1e-9),
-                torque: at(Signal { node, what: What::Torque })?,
-                speed: at(Signal { node, what: What::Speed })?,
+                torque: at(Signal { node, what: SignalKind::Torque })?,
+                speed: at(Signal { node, what: SignalKind::Speed })?,
             })
         };
         let position = look.as_ref().and_then(|wired| at(wired.position));
@@ -286,9 +286,9 @@ mod tests {
     }
 
     const WATCHED: [Signal; 3] = [
-        Signal { node: 0, what: What::Speed },
-        Signal { node: 0, what: What::Torque },
-        Signal { node: 0, what: What::Position },
+        Signal { node: 0, what: SignalKind::Speed },
+        Signal { node: 0, what: SignalKind::Torque },
+        Signal { node: 0, what: SignalKind::Position },
     ];
 
     #[test]

@@ -15,7 +15,7 @@
 use super::watches;
 use crate::drive::profiles;
 use crate::safety::{OutputLimits, Protection, is_present};
-use abi::rig::{Kind, Mode, Rig, What};
+use abi::rig::{Kind, Mode, Rig, SignalKind};
 
 /// Dead time beyond that of the drive for which a command may be under way, s: a late cycle, a busy bus.
 const SLACK: f64 = 1e-3;
@@ -69,7 +69,7 @@ impl Followed {
         let node = &rig.nodes[at.node];
         let asked = node.asks_for(commanded.what)?;
         let period = rig.period_ns as f64 * 1e-9;
-        let torque = asked == What::Torque;
+        let torque = asked == SignalKind::Torque;
         let half = 0.5 * (limits.high - limits.low);
         let (tolerance, late) = match &node.kind {
             Kind::Cia402(drive) => {
@@ -86,7 +86,7 @@ impl Followed {
                 (tolerance, waits + 2.0 * profile.refresh_ns as f64 * 1e-9)
             }
             Kind::Frames(messages) => {
-                let What::Field(message, field) = at.what else { return None };
+                let SignalKind::Field(message, field) = at.what else { return None };
                 let message = &messages[message];
                 // Its reading may be as old as the interval between its frames.
                 let apart_ns = if message.period_ns > 0 { message.period_ns } else { node.timeout_ns };

@@ -4,7 +4,7 @@
 //! torque and speed, the numbers for the rig's text. Knows neither buses nor drives: it runs like any model.
 
 use abi::description::{Kind as QuantityKind, Layout, Quantity};
-use abi::rig::{Kind, Mode, Output, Rig, Signal, What};
+use abi::rig::{Kind, Mode, Output, Rig, Signal, SignalKind};
 use abi::table::Interpret;
 use abi::unit::Unit;
 use abi::{Code, Description, Function, Instance, Slot};
@@ -77,7 +77,7 @@ impl Identification {
         let layout = Layout::new([0, 0, 0, 0, 0, drives.len() as u32, 0, 0, 0, 0]);
         let period = rig.period_ns as f64 * 1e-9;
         let limits = |node: usize| {
-            let of = |output: &&Output| output.signal.node == node && output.signal.what == What::Torque;
+            let of = |output: &&Output| output.signal.node == node && output.signal.what == SignalKind::Torque;
             let rated = match &rig.nodes[node].kind {
                 Kind::Cia402(drive) => drive.rated_torque,
                 Kind::Frames(_) => 0.0,
@@ -91,7 +91,7 @@ impl Identification {
         let mut heights = Vec::new();
         for (i, node) in drives.iter().enumerate() {
             let (low, high, slew) = limits(*node);
-            let signal = Signal { node: *node, what: What::Torque };
+            let signal = Signal { node: *node, what: SignalKind::Torque };
             outputs.push(Output { signal, slot: layout.outputs.slot(i), low, high, slew, safe: 0.0 });
             heights.push(PART * high.min(-low).max(0.0));
         }
@@ -246,7 +246,7 @@ pub fn rows(hil: &mut super::cycle::Hil, asked: &Identification) -> Vec<Row> {
                 asked.drives.iter().map(signal).collect()
             };
             let told = control.supervisor().permitted().to_vec();
-            rows.push(Row { told, torque: read(What::Torque), speed: read(What::Speed) });
+            rows.push(Row { told, torque: read(SignalKind::Torque), speed: read(SignalKind::Speed) });
         }
         if hil.ended().is_some() {
             return rows;

@@ -9,7 +9,7 @@
 use crate::safety::{Protection, is_present};
 use abi::description::Guard;
 use abi::format::three_digits;
-use abi::live::{Live, NUMBERS, Place};
+use abi::live::{Live, NUMBERS, Tunable};
 use abi::unit::{NoQuantity, Unit, quantity};
 use abi::{Function, Instance, Slot};
 use std::sync::Arc;
@@ -148,7 +148,7 @@ impl Judge {
     /// The message for a refused set.
     pub fn words(&self, objection: &Objection) -> String {
         let path = |slot: Slot| {
-            let here = |place: &Place| matches!(place, Place::Live(control, _) if *control == slot);
+            let here = |place: &Tunable| matches!(place, Tunable::Live(control, _) if *control == slot);
             let found = self.live.params.iter().find(|param| here(&param.place));
             found.map_or_else(|| format!("slot {}", slot.0), |param| format!("`{}`", param.path))
         };
@@ -188,8 +188,8 @@ impl Judge {
             let (path, value) = (path.trim(), value.trim());
             let Some(param) = self.live.param(path) else { return Err(self.unknown(path)) };
             let slot = match &param.place {
-                Place::Live(slot, _) => *slot,
-                Place::Start(why) => {
+                Tunable::Live(slot, _) => *slot,
+                Tunable::Start(why) => {
                     return Err(format!("only a start reads `{path}`: {why}; start with `--set {path}={value}`"));
                 }
             };

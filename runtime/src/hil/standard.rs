@@ -8,7 +8,7 @@
 use super::coupling::{Contact, contacts};
 use crate::coupling::lag::Lag;
 use crate::coupling::predictor::{self, Lookahead, Torque};
-use abi::rig::{Kind, Rig, What};
+use abi::rig::{Kind, Rig, SignalKind};
 use abi::{Instance, Slot};
 
 /// Fine steps per period.
@@ -141,7 +141,7 @@ impl Stand<'_> {
     }
 
     /// The slots that read this quantity of the shaft.
-    fn slots(&self, what: What) -> Vec<Slot> {
+    fn slots(&self, what: SignalKind) -> Vec<Slot> {
         self.rig.inputs.iter().filter(|input| input.signal.what == what).map(|input| input.slot).collect()
     }
 
@@ -156,7 +156,7 @@ impl Stand<'_> {
         let sign = predictor::sign(rig, plant, output.signal, output.signal.node);
         let period = rig.period_ns as f64 * 1e-9;
         let dead_ns = (node.delay * 1e9).round() as u64 + if drive.at_sync { rig.period_ns } else { 0 };
-        let (speeds, positions) = (self.slots(What::Speed), self.slots(What::Position));
+        let (speeds, positions) = (self.slots(SignalKind::Speed), self.slots(SignalKind::Position));
         let mut model = self.model.clone();
         let steps = u64::from(rig.steps.max(1));
         let fine = period / FINE as f64;
@@ -165,7 +165,7 @@ impl Stand<'_> {
         // A shaft with a prescribed speed is not free, so there is nothing to predict.
         let free = matches!(motion, Motion::Pulled(_));
         let looks = played && free && rig.predict == Some(output.signal.node);
-        let other = |other: &abi::rig::Output| other.signal.what == What::Torque && other.signal != output.signal;
+        let other = |other: &abi::rig::Output| other.signal.what == SignalKind::Torque && other.signal != output.signal;
         let told = rig.outputs.iter().any(other);
         let mut look = looks.then(|| {
             let torques = vec![Torque::new(dead_ns, node.lag), Torque::new(0, 0.0)];

@@ -8,7 +8,7 @@ use crate::realtime::clock::monotonic_ns;
 use crate::safety::{DriveLimits, OutputLimits, Protection, Refused, is_present};
 use abi::Instance;
 use abi::format::three_digits;
-use abi::rig::{Kind, Mode, Output, Rig, Signal, What};
+use abi::rig::{Kind, Mode, Output, Rig, Signal, SignalKind};
 
 /// Highest torque and speed of a drive, where known.
 #[derive(Clone, Copy, PartialEq, Debug, Default)]
@@ -20,7 +20,7 @@ pub struct Bounds {
 }
 
 /// The signal in which a node reports its torque, speed or position.
-pub fn measured_signal(rig: &Rig, node: usize, what: What) -> Option<Signal> {
+pub fn measured_signal(rig: &Rig, node: usize, what: SignalKind) -> Option<Signal> {
     rig.nodes[node].tells(what).map(|what| Signal { node, what })
 }
 
@@ -39,7 +39,7 @@ pub fn missing_monitors(rig: &Rig) -> Vec<String> {
         let tells = |what| measured_signal(rig, node, what).is_some();
         let commands = || rig.outputs.iter().filter(|output| output.signal.node == node);
         let asks = |output: &Output| rig.nodes[node].asks_for(output.signal.what);
-        let torque = commands().any(|output| asks(output) == Some(What::Torque));
+        let torque = commands().any(|output| asks(output) == Some(SignalKind::Torque));
         let mut lacks = Vec::new();
         let mut needs = |watch: &str, has: &[(bool, &str)]| {
             let missing: Vec<&str> = has.iter().filter(|(there, _)| !there).map(|(_, why)| *why).collect();
@@ -47,10 +47,13 @@ pub fn missing_monitors(rig: &Rig) -> Vec<String> {
                 lacks.push(format!("{watch} ({})", missing.join(", ")));
             }
         };
-        let speed = (tells(What::Speed), "it tells no speed");
+        let speed = (tells(SignalKind::Speed), "it tells no speed");
         let fastest = (within.max_speed.is_some(), "give `speed_max`");
         needs("speed", &[speed, fastest]);
-        needs("travel", &[(tells(What::Position), "it tells no position"), (within.travel.is_some(), "give `travel`")]);
+        needs(
+            "travel",
+            &[(tells(SignalKind::Position), "it tells no position"), (within.travel.is_some(), "give `travel`")],
+        );
         if torque {
             let power = within.max_power.is_some() || within.max_speed.is_some();
             needs("power", &[speed, (power, "give `power_max`")]);
@@ -135,7 +138,7 @@ pub fn drive_limits(rig: &Rig, node: usize, bounds: &[Bounds]) -> Result<DriveLi
         let within = rig.nodes[node].within;
         let speed = within.max_speed.unwrap_or(f64::INFINITY);
         let torques = rig.outputs.iter().filter(|output| output.signal.node == node);
-        let torques = torques.filter(|output| rig.nodes[node].asks_for(output.signal.what) == Some(What::Torque));
+        let torques = torques.filter(|output| rig.nodes[node].asks_for(output.signal.what) == Some(SignalKind::Torque));
         let most = torques.map(|output| output.high.abs().max(output.low.abs()) * speed).fold(f64::INFINITY, f64::min);
         let travel = within.travel.unwrap_or((f64::NEG_INFINITY, f64::INFINITY));
         return Ok(DriveLimits { speed, travel, power: within.max_power.unwrap_or(most) });
@@ -156,7 +159,7 @@ pub fn output_limits(rig: &Rig, output: &Output, moving: &[usize], bounds: &[Bou
     let Output { signal, low, high, slew, safe, .. } = *output;
     let drive = moving.iter().position(|node| *node == signal.node);
     let (mut low, mut high) = (low, high);
-    let torque = drive.is_some() && rig.nodes[signal.node].asks_for(signal.what) == Some(What::Torque);
+    let torque = drive.is_some() && rig.nodes[signal.node].asks_for(signal.what) == Some(SignalKind::Torque);
     if let Kind::Cia402(described) = &rig.nodes[signal.node].kind {
         let most = bounds_of(rig, signal.node, bounds);
         let (least, greatest) = match described.mode {
@@ -204,7 +207,7 @@ mod tests {
     use crate::safety::Cause;
     use crate::testing::rigs;
     use abi::Instance;
-    use abi::rig::{Field, Format, Message, Within};
+    use abi::rig::{DriveLimits, Field, Format, Message};
     use abi::unit::Unit;
 
     /// The periods scale with the measured step time, so the load of this computer does not matter.
@@ -242,18 +245,18 @@ mod tests {
     }
 
     /// The spring model with a drive described by frames: a torque command, and the given signals as answers.
-    fn framed(tells: &[(&str, &str)], within: Within) -> (Rig, Instance) {
+    fn framed(tells: &[(&str, &str)], within: DriveLimits) -> (Rig, Instance) {
         let (mut rig, model) = rigs::rig();
         let mut messages = vec![message("command", "N·m", 0x205, true)];
         messages.extend((0x185..).zip(tells).map(|(id, (name, unit))| message(name, unit, id, false)));
         (rig.nodes[0].kind, rig.nodes[0].within) = (Kind::Frames(messages), within);
-        rig.outputs[0].signal.what = What::Field(0, 0);
-        rig.inputs[0].signal.what = What::Field(1, 0);
+        rig.outputs[0].signal.what = SignalKind::Field(0, 0);
+        rig.inputs[0].signal.what = SignalKind::Field(1, 0);
         (rig, model)
     }
 
     const ALL: [(&str, &str); 3] = [("omega", "rpm"), ("angle", "deg"), ("torque", "N·m")];
-    const WITHIN: Within = Within { max_speed: Some(10.0), travel: Some((-1.0, 1.0)), max_power: Some(2.0) };
+    const WITHIN: DriveLimits = DriveLimits { max_speed: Some(10.0), travel: Some((-1.0, 1.0)), max_power: Some(2.0) };
 
     /// The cause of the stop and its tick; `now` returns speed, position and torque of each tick from the output
     /// permitted in the tick before.
@@ -264,7 +267,7 @@ mod tests {
         assert!(control.supervisor_mut().arm());
         let places: Vec<usize> = control
             .signals()
-            .map(|signal| if let What::Field(message, _) = signal.what { message - 1 } else { unreachable!() })
+            .map(|signal| if let SignalKind::Field(message, _) = signal.what { message - 1 } else { unreachable!() })
             .collect();
         for k in 0..400 {
             let values = now(k, control.supervisor().permitted()[0]);
@@ -296,7 +299,7 @@ mod tests {
     fn missing_checks_are_reported() {
         let said = |tells: &[(&str, &str)], within| missing_monitors(&framed(tells, within).0).join("; ");
         assert_eq!(said(&ALL, WITHIN), "drive `load` is not watched for its state (frames have no status word)");
-        let power = Within { max_power: None, ..WITHIN };
+        let power = DriveLimits { max_power: None, ..WITHIN };
         assert_eq!(said(&ALL, power), said(&ALL, WITHIN), "greatest torque times greatest speed");
         let mute = said(&[("enable", "1")], WITHIN);
         for lack in [
@@ -308,7 +311,7 @@ mod tests {
         ] {
             assert!(mute.contains(lack), "{mute}");
         }
-        let free = said(&ALL, Within::default());
+        let free = said(&ALL, DriveLimits::default());
         assert!(free.contains("speed (give `speed_max`)") && free.contains("travel (give `travel`)"), "{free}");
         // Of two speeds, the one named `speed` is the drive's own.
         assert!(said(&[("a", "rpm"), ("b", "rpm")], WITHIN).contains("speed (it tells no speed)"));

@@ -5,21 +5,21 @@ use crate::realtime::histogram::Histogram;
 use crate::safety::Cause;
 use abi::Description;
 use abi::format;
-use abi::rig::{Kind, Rig, Signal, What};
+use abi::rig::{Kind, Rig, Signal, SignalKind};
 use std::fmt::Write;
 
 /// A signal as the text of a rig names it: `load.speed`.
 pub fn signal(rig: &Rig, signal: Signal) -> String {
     let node = &rig.nodes[signal.node];
     let name = match (signal.what, &node.kind) {
-        (What::Torque, _) => "torque",
-        (What::Speed, _) => "speed",
-        (What::Position, _) => "position",
-        (What::Enabled, _) => "enabled",
-        (What::Fault, _) => "fault",
-        (What::Limited, _) => "limited",
-        (What::Field(message, field), Kind::Frames(messages)) => &messages[message].fields[field].name,
-        (What::Field(..), Kind::Cia402(_)) => "?",
+        (SignalKind::Torque, _) => "torque",
+        (SignalKind::Speed, _) => "speed",
+        (SignalKind::Position, _) => "position",
+        (SignalKind::Enabled, _) => "enabled",
+        (SignalKind::Fault, _) => "fault",
+        (SignalKind::Limited, _) => "limited",
+        (SignalKind::Field(message, field), Kind::Frames(messages)) => &messages[message].fields[field].name,
+        (SignalKind::Field(..), Kind::Cia402(_)) => "?",
     };
     format!("{}.{name}", node.name)
 }

@@ -4,7 +4,7 @@ use crate::can::Frame;
 use crate::drive::{Bench, Fieldbus, Options, Step};
 use crate::testing::models::Model;
 use crate::testing::nodes;
-use abi::rig::{Field, Format, Kind, Message, Mode, Node, Plant, Rig, Signal, What, Within};
+use abi::rig::{DriveLimits, Field, Format, Kind, Message, Mode, Node, Plant, Rig, Signal, SignalKind};
 use abi::unit::Unit;
 use abi::{Function, Instance, Slot};
 
@@ -48,7 +48,7 @@ fn panel() -> Node {
         delay: 0.0,
         lag: 0.0,
         timeout_ns: 100_000_000,
-        within: Within::default(),
+        within: DriveLimits::default(),
     }
 }
 
@@ -61,9 +61,9 @@ fn slots(plant: &Instance) -> [Slot; 4] {
 /// Two drives and a panel at 1 kHz, both drives in this mode.
 pub fn rig(mode: Mode) -> Rig {
     let what = match mode {
-        Mode::Torque => What::Torque,
-        Mode::Speed => What::Speed,
-        Mode::Position => What::Position,
+        Mode::Torque => SignalKind::Torque,
+        Mode::Speed => SignalKind::Speed,
+        Mode::Position => SignalKind::Position,
     };
     let output = |node, what| nodes::output(node, what, Slot(0), [f64::NEG_INFINITY, f64::INFINITY]);
     let [load, servo, position, speed] = slots(&shaft(0.012, 0.001));
@@ -71,15 +71,15 @@ pub fn rig(mode: Mode) -> Rig {
     let all = vec![drive("load", 3, mode), drive("servo", 4, mode), panel()];
     Rig {
         method: abi::plan::Method::Expo,
-        outputs: vec![output(LOAD, what), output(SERVO, what), output(PANEL, What::Field(1, 0))],
+        outputs: vec![output(LOAD, what), output(SERVO, what), output(PANEL, SignalKind::Field(1, 0))],
         predict: Some(LOAD),
         plant: Plant {
-            applied: vec![(signal(LOAD, What::Torque), load), (signal(SERVO, What::Torque), servo)],
+            applied: vec![(signal(LOAD, SignalKind::Torque), load), (signal(SERVO, SignalKind::Torque), servo)],
             seen: vec![
-                (signal(LOAD, What::Position), position),
-                (signal(LOAD, What::Speed), speed),
-                (signal(SERVO, What::Position), position),
-                (signal(SERVO, What::Speed), speed),
+                (signal(LOAD, SignalKind::Position), position),
+                (signal(LOAD, SignalKind::Speed), speed),
+                (signal(SERVO, SignalKind::Position), position),
+                (signal(SERVO, SignalKind::Speed), speed),
             ],
             inertia: Some(0.012),
         },
@@ -222,7 +222,7 @@ impl Table {
         panic!("stays at {:?}", self.fieldbus.step());
     }
 
-    pub fn value(&self, node: usize, what: What) -> f64 {
+    pub fn value(&self, node: usize, what: SignalKind) -> f64 {
         self.fieldbus.reading(Signal { node, what }).value
     }
 }

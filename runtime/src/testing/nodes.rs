@@ -4,7 +4,7 @@
 
 use abi::Slot;
 use abi::plan::Method;
-use abi::rig::{Bus, Cia402, Kind, Mode, Node, Output, Overrun, Plant, Rig, Signal, What, Within};
+use abi::rig::{Bus, Cia402, DriveLimits, Kind, Mode, Node, Output, Overrun, Plant, Rig, Signal, SignalKind};
 
 /// A CiA 402 drive of a rig with this period: torque up to its rated 4 N·m, speed up to 200 rad/s.
 pub fn drive(name: &str, node: u8, mode: Mode, period_ns: u64) -> Node {
@@ -29,7 +29,7 @@ pub fn drive(name: &str, node: u8, mode: Mode, period_ns: u64) -> Node {
         delay: 0.8e-9 * period_ns as f64,
         lag: 0.6e-3,
         timeout_ns: 3 * period_ns,
-        within: Within::default(),
+        within: DriveLimits::default(),
     }
 }
 
@@ -41,7 +41,7 @@ pub fn limited(node: Node, torque: f64) -> Node {
 }
 
 /// An output with this signal, between two bounds.
-pub fn output(node: usize, what: What, slot: Slot, [low, high]: [f64; 2]) -> Output {
+pub fn output(node: usize, what: SignalKind, slot: Slot, [low, high]: [f64; 2]) -> Output {
     Output { signal: Signal { node, what }, slot, low, high, slew: f64::INFINITY, safe: 0.0 }
 }
 

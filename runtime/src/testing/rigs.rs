@@ -3,9 +3,9 @@
 use crate::hil::live::Judge;
 use crate::testing::models::Model;
 use crate::testing::nodes;
-use abi::live::{Check, Live, Param, Place};
+use abi::live::{Check, Live, Param, Tunable};
 use abi::plan::Series;
-use abi::rig::{Input, Mode, Node, Plant, Rig, Signal, What};
+use abi::rig::{Input, Mode, Node, Plant, Rig, Signal, SignalKind};
 use abi::unit::Unit;
 use abi::{Function, Instance};
 
@@ -30,8 +30,13 @@ pub fn rig() -> (Rig, Instance) {
     let layout = &model.description().layout;
     let signal = |what| Signal { node: 0, what };
     let rig = Rig {
-        inputs: vec![Input { signal: signal(What::Speed), slot: layout.inputs.slot(0), start: 0.0, needed: true }],
-        outputs: vec![nodes::output(0, What::Torque, layout.outputs.slot(0), [-1.0, 1.0])],
+        inputs: vec![Input {
+            signal: signal(SignalKind::Speed),
+            slot: layout.inputs.slot(0),
+            start: 0.0,
+            needed: true,
+        }],
+        outputs: vec![nodes::output(0, SignalKind::Torque, layout.outputs.slot(0), [-1.0, 1.0])],
         plant: Plant { applied: Vec::new(), seen: Vec::new(), inertia: Some(0.012) },
         ..nodes::rig("spring", "sim:bench", PERIOD_NS, vec![drive("load", 3)])
     };
@@ -94,7 +99,7 @@ pub fn judge(control: &Instance) -> Judge {
         path: path.into(),
         unit: unit(text),
         boolean: false,
-        place: Place::Live(inside.params.slot(i), judged.params.slot(i)),
+        place: Tunable::Live(inside.params.slot(i), judged.params.slot(i)),
     };
     let range = |i: usize, path: &str, text: &str, strict, high: Option<usize>| Check::Range {
         path: path.into(),
@@ -155,7 +160,7 @@ pub fn pair() -> (Rig, Instance, Instance) {
         .build();
     let (inside, outside) = (control.description().layout.clone(), plant.description().layout.clone());
     let signal = |node, what| Signal { node, what };
-    let output = |node, i, most: f64| nodes::output(node, What::Torque, inside.outputs.slot(i), [-most, most]);
+    let output = |node, i, most: f64| nodes::output(node, SignalKind::Torque, inside.outputs.slot(i), [-most, most]);
     let input =
         |node, what, i| Input { signal: signal(node, what), slot: inside.inputs.slot(i), start: 0.0, needed: true };
     let rig = Rig {
@@ -163,7 +168,7 @@ pub fn pair() -> (Rig, Instance, Instance) {
         // The drives limit torque themselves, too (object 6072): a wrong value that passes the checksum stays within
         // the limit.
         nodes: vec![nodes::limited(drive("load", 3), 1.0), nodes::limited(drive("servo", 4), 2.0)],
-        inputs: vec![input(0, What::Speed, 0), input(1, What::Position, 1)],
+        inputs: vec![input(0, SignalKind::Speed, 0), input(1, SignalKind::Position, 1)],
         outputs: vec![output(1, 0, 2.0), output(0, 1, 1.0)],
         record: vec![Series {
             label: "v".into(),
@@ -173,14 +178,14 @@ pub fn pair() -> (Rig, Instance, Instance) {
         }],
         plant: Plant {
             applied: vec![
-                (signal(1, What::Torque), outside.inputs.slot(0)),
-                (signal(0, What::Torque), outside.inputs.slot(1)),
+                (signal(1, SignalKind::Torque), outside.inputs.slot(0)),
+                (signal(0, SignalKind::Torque), outside.inputs.slot(1)),
             ],
             seen: vec![
-                (signal(0, What::Position), outside.outputs.slot(0)),
-                (signal(0, What::Speed), outside.outputs.slot(1)),
-                (signal(1, What::Position), outside.outputs.slot(0)),
-                (signal(1, What::Speed), outside.outputs.slot(1)),
+                (signal(0, SignalKind::Position), outside.outputs.slot(0)),
+                (signal(0, SignalKind::Speed), outside.outputs.slot(1)),
+                (signal(1, SignalKind::Position), outside.outputs.slot(0)),
+                (signal(1, SignalKind::Speed), outside.outputs.slot(1)),
             ],
             inertia: Some(0.012),
         },

@@ -5,7 +5,7 @@
 //! with its companions, so the table itself is not changed.
 
 use super::{Table, extremes};
-use crate::compile::Fitted;
+use crate::compile::PreparedRun;
 use crate::quantity::{count, significant};
 use crate::results;
 use crate::vary::Dice;
@@ -93,7 +93,7 @@ impl Table {
             true => Continue::Break(()),
             false => Continue::Continue(()),
         };
-        let Ok((run, Fitted { instance, experiment })) = self.fitted(number, dice) else { return Some(None) };
+        let Ok((run, PreparedRun { instance, experiment })) = self.fitted(number, dice) else { return Some(None) };
         // With guards on ranges, as for the row: a run that left a range has no error either.
         let (case, description) = (&self.cases[run.at], run.description);
         let ended = engine::run(instance.clone(), &experiment, watch).ok().filter(|outcome| {

@@ -4,7 +4,7 @@
 
 use super::words::{Value, literal, model_of};
 use super::{Fault, Session, Setup, TEXT, Used, What, begin, found};
-use crate::compile::{self, Case, Changes, Explanation, Listed, Loaded, Lookup, SourceFile, Space};
+use crate::compile::{self, Case, Changes, Explanation, Loaded, Lookup, QuantityInfo, SourceFile, Space};
 use crate::project;
 use abi::unit::{Dimension, Unit};
 use grammar::ast::{self, Item};
@@ -105,13 +105,13 @@ impl Session {
     }
 
     /// Quantities for completion: those of the instances, then those of the last run.
-    pub fn quantities(&self) -> impl Iterator<Item = &Listed> {
+    pub fn quantities(&self) -> impl Iterator<Item = &QuantityInfo> {
         let staged = self.stage.as_ref().map_or(&[][..], |(_, setup)| &setup.known);
         self.bench.known.iter().chain(staged)
     }
 
     /// Every quantity of `what`; empty if it does not compile in its present form.
-    pub(super) fn listed(&self, what: &What, setup: &Setup) -> Arc<[Listed]> {
+    pub(super) fn listed(&self, what: &What, setup: &Setup) -> Arc<[QuantityInfo]> {
         let (mut loaded, name) = self.loaded(what, "");
         let changes = Changes { set: setup.set.clone(), unjudged: true, ..Changes::default() };
         compile::quantities(&mut loaded, &project::Disk, &name, &changes).unwrap_or_default().into()

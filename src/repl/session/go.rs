@@ -5,7 +5,7 @@
 
 use super::words::{Value, rewired, unit_as_typed};
 use super::{Fault, Session, Setup, What, begin, found};
-use crate::compile::{self, Case, Changes, Listed, Options, Varying};
+use crate::compile::{self, Case, Changes, Options, QuantityInfo, Varying};
 use crate::{project, quantity};
 use abi::plan::{Method, Series};
 use abi::unit::Unit;
@@ -201,7 +201,7 @@ impl Session {
         }
         let (mut loaded, name) = self.loaded(&what, "");
         let setup = Setup { also: Vec::new(), duration: Some(1e3 * h), ..self.setup(&what).clone() };
-        let shown: Vec<&Listed> = setup.known.iter().filter(|q| q.kind != "param").collect();
+        let shown: Vec<&QuantityInfo> = setup.known.iter().filter(|q| q.kind != "param").collect();
         let paths: Vec<&str> = shown.iter().map(|q| q.path.as_str()).collect();
         let changes = Changes {
             set: setup.set.clone(),
@@ -228,7 +228,7 @@ impl Session {
             return Err(Fault::Stopped(Box::new(Failure { cause, time, recording: Default::default() })));
         }
         let series = case.experiment.plots.last().map_or(&[][..], |plot| &plot.series[..]);
-        let one = |(listed, series): (&&Listed, &Series)| {
+        let one = |(listed, series): (&&QuantityInfo, &Series)| {
             let of = |instance: &Instance| Value {
                 si: instance.get(series.slot),
                 unit: series.unit.clone(),

@@ -18,7 +18,7 @@ pub use edit::library_models;
 pub use go::{Cut, Ran};
 pub use words::{Value, plain};
 
-use crate::compile::{self, Case, Changes, Listed, Loaded, Options, SourceFile};
+use crate::compile::{self, Case, Changes, Loaded, Options, QuantityInfo, SourceFile};
 use crate::project;
 use abi::{Instance, Slot};
 use grammar::diagnostic::{Diagnostic, Label};
@@ -78,7 +78,7 @@ struct Setup {
     /// Its present state.
     live: Option<Instance>,
     /// Its quantities.
-    known: Arc<[Listed]>,
+    known: Arc<[QuantityInfo]>,
 }
 
 /// `f = LuGre(vd = 10 mm/s)`

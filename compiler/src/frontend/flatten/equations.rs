@@ -212,12 +212,12 @@ impl<'a> Flattener<'a> {
             return;
         }
         match wanted {
-            Wanted::Value => {
+            DefinitionKind::Value => {
                 let origin = Origin::Equation(equation.target.span());
                 self.system.vars[var.0 as usize].definition = Definition::Value(value, origin);
             }
-            Wanted::Rate { along } => rates.push((var, Rate { value, along, span: equation.target.span() })),
-            Wanted::Next => {
+            DefinitionKind::Rate { along } => rates.push((var, Rate { value, along, span: equation.target.span() })),
+            DefinitionKind::Next => {
                 self.refused.push(var);
                 let error = Diagnostic::error("E0308", "`next` belongs inside an `every` block")
                     .label(equation.target.span(), "when is the next tick?")
@@ -228,7 +228,7 @@ impl<'a> Flattener<'a> {
     }
 
     /// The quantity that an equation defines, and the kind of definition.
-    pub(super) fn target(&mut self, id: InstanceId, target: &'a Target) -> Option<(VarId, Wanted)> {
+    pub(super) fn target(&mut self, id: InstanceId, target: &'a Target) -> Option<(VarId, DefinitionKind)> {
         let name = target.name();
         let var = match self.tree(id).names.get(name.text.as_str()) {
             Some(Binding::Var(var)) => *var,
@@ -260,18 +260,18 @@ impl<'a> Flattener<'a> {
         var: VarId,
         kind: VarKind,
         declared: Span,
-    ) -> Option<(VarId, Wanted)> {
+    ) -> Option<(VarId, DefinitionKind)> {
         let name = target.name();
         match (target, kind) {
-            (Target::Name(_), VarKind::Output | VarKind::Let) => Some((var, Wanted::Value)),
-            (Target::Next { .. }, VarKind::State) => Some((var, Wanted::Next)),
+            (Target::Name(_), VarKind::Output | VarKind::Let) => Some((var, DefinitionKind::Value)),
+            (Target::Next { .. }, VarKind::State) => Some((var, DefinitionKind::Next)),
             (Target::Derivative { along, .. }, VarKind::State) => {
                 if along.text == "t" {
-                    return Some((var, Wanted::Rate { along: None }));
+                    return Some((var, DefinitionKind::Rate { along: None }));
                 }
                 match self.var_named(id, &along.text) {
                     Some(path) if self.system.var(path).kind == VarKind::State => {
-                        Some((var, Wanted::Rate { along: Some((path, along.span)) }))
+                        Some((var, DefinitionKind::Rate { along: Some((path, along.span)) }))
                     }
                     _ => {
                         let error = Diagnostic::error(
@@ -371,13 +371,13 @@ impl<'a> Flattener<'a> {
                     let span = equation.target.span();
                     let Some((var, wanted)) = self.target(id, &equation.target) else { continue };
                     match wanted {
-                        Wanted::Value => {
+                        DefinitionKind::Value => {
                             if self.once(var, span, defined) {
                                 let origin = Origin::Equation(span);
                                 self.system.vars[var.0 as usize].definition = Definition::Held { value, block, origin };
                             }
                         }
-                        Wanted::Next => {
+                        DefinitionKind::Next => {
                             if self.once(var, span, defined)
                                 && let Definition::Continuous { initial, .. } = self.system.var(var).definition
                             {
@@ -385,7 +385,7 @@ impl<'a> Flattener<'a> {
                                     Definition::Sampled { initial, next: value, block };
                             }
                         }
-                        Wanted::Rate { .. } => {
+                        DefinitionKind::Rate { .. } => {
                             self.refused.push(var);
                             let name = &equation.target.name().text;
                             let error = Diagnostic::error("E0308", "a derivative does not belong inside `every`")
@@ -434,7 +434,7 @@ impl<'a> Flattener<'a> {
         /// One definition in one regime.
         struct InMode {
             var: VarId,
-            along: Option<Along>,
+            along: Option<PathVariable>,
             value: ExprId,
             span: Span,
             statement: Span,
@@ -452,9 +452,9 @@ impl<'a> Flattener<'a> {
                     continue;
                 }
                 let along = match wanted {
-                    Wanted::Value => None,
-                    Wanted::Rate { along } => Some(along),
-                    Wanted::Next => {
+                    DefinitionKind::Value => None,
+                    DefinitionKind::Rate { along } => Some(along),
+                    DefinitionKind::Next => {
                         self.refused.push(var);
                         let error = Diagnostic::error("E0308", "`next` belongs inside an `every` block")
                             .label(span, "a regime is continuous")
@@ -519,7 +519,7 @@ impl<'a> Flattener<'a> {
             if !self.once(var, span, defined) {
                 continue;
             }
-            let ones: Vec<(Option<Along>, ExprId)> = by_mode
+            let ones: Vec<(Option<PathVariable>, ExprId)> = by_mode
                 .iter()
                 .map(|here| here.iter().find(|one| one.var == var).map(|one| (one.along, one.value)).expect("complete"))
                 .collect();

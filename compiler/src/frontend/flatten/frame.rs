@@ -1,7 +1,7 @@
 //! The frame of a rig around its instance: drives and devices with their signals, parts that belong to the rig alone,
 //! and expressions over all of these.
 //!
-//! In: a [`Frame`]. Out: [`Framed`], which locates its contents in the system. Knows nothing of buses.
+//! In: a [`Frame`]. Out: [`RigFrame`], which locates its contents in the system. Knows nothing of buses.
 
 use super::*;
 
@@ -47,7 +47,7 @@ pub enum Scope {
 }
 
 /// Location of a frame in the system.
-pub struct Framed {
+pub struct RigFrame {
     /// The rig itself.
     pub rig: InstanceId,
     /// Its drives and devices, in order.
@@ -60,7 +60,7 @@ pub struct Framed {
 
 impl<'a> Flattener<'a> {
     /// Instantiates a frame around the first instance.
-    pub(super) fn surround(&mut self, frame: &Frame<'a>, overrides: &[Change<'a>]) -> Framed {
+    pub(super) fn surround(&mut self, frame: &Frame<'a>, overrides: &[Change<'a>]) -> RigFrame {
         let top = InstanceId(0);
         let names = self.tree(top).names.clone();
         let rig = self.scope(frame.model, frame.file, names);
@@ -71,7 +71,7 @@ impl<'a> Flattener<'a> {
         };
         let mut nodes = Vec::new();
         for node in &frame.nodes {
-            let made = Making {
+            let made = Instantiation {
                 path: node.name.text.clone(),
                 rotary: false,
                 span: node.instance.model.span,
@@ -99,7 +99,7 @@ impl<'a> Flattener<'a> {
                 None
             }
         });
-        Framed { rig, nodes, hardware, expressions: Vec::new() }
+        RigFrame { rig, nodes, hardware, expressions: Vec::new() }
     }
 
     /// An instance without quantities of its own, which only provides these names.
@@ -129,7 +129,7 @@ impl<'a> Flattener<'a> {
     }
 
     /// Reads the expressions of a frame.
-    pub(super) fn framed(&mut self, frame: &Frame<'a>, framed: &mut Framed) {
+    pub(super) fn framed(&mut self, frame: &Frame<'a>, framed: &mut RigFrame) {
         let rig = Env { instance: Some(framed.rig), ..Env::file(frame.file) };
         let inside = match framed.hardware {
             Some(part) => {

@@ -13,7 +13,7 @@ impl<'a> Flattener<'a> {
         overrides: Vec<Change<'a>>,
     ) -> Option<InstanceId> {
         let (item, model) = self.model(env.file, &instance.model)?;
-        let made = Making {
+        let made = Instantiation {
             path: String::new(),
             rotary: instance.rotary,
             span: instance.model.span,
@@ -88,7 +88,7 @@ impl<'a> Flattener<'a> {
         &mut self,
         model: &'a ast::Model,
         file: FileId,
-        made: Making<'a>,
+        made: Instantiation<'a>,
         alone: bool,
     ) -> InstanceId {
         let id = InstanceId(self.system.instances.len() as u32);
@@ -503,7 +503,7 @@ impl<'a> Flattener<'a> {
             self.dropped.extend::<Vec<_>>(dropped);
         }
         self.models.push(item);
-        let made = Making { path, rotary, span: instance.model.span, args, overrides: changes };
+        let made = Instantiation { path, rotary, span: instance.model.span, args, overrides: changes };
         let made = self.instantiate(model, item.file, made, false);
         self.models.pop();
         if !fits {

@@ -1,8 +1,8 @@
 //! Flattening: turns an instance with all its parts into one [`System`].
 //!
-//! In: a [`Request`] and the resolved texts. Out: a [`Flat`]. Declares every name of the whole tree before it reads any
-//! expression, so the order of the text is irrelevant. Checks names: unknown ones, arguments, slots, and that each
-//! quantity is defined exactly once. Knows nothing of units or of evaluation order.
+//! In: a [`Request`] and the resolved texts. Out: a [`Flattened`]. Declares every name of the whole tree before it
+//! reads any expression, so the order of the text is irrelevant. Checks names: unknown ones, arguments, slots, and that
+//! each quantity is defined exactly once. Knows nothing of units or of evaluation order.
 
 mod equations;
 mod expressions;
@@ -21,7 +21,7 @@ use grammar::span::{FileId, Span};
 use std::collections::HashMap;
 use std::rc::Rc;
 
-pub use frame::{Frame, Framed, Node as BusNode, Scope};
+pub use frame::{Frame, Node as BusNode, RigFrame, Scope};
 
 /// Limit on the quantities of one instance with all its parts.
 pub const MOST_VARS: usize = 200_000;
@@ -90,19 +90,19 @@ pub enum OverrideValue<'a> {
 }
 
 /// Result of flattening.
-pub struct Flat {
+pub struct Flattened {
     /// The system; complete only if there are no errors.
     pub system: System,
     /// One node for each observed expression.
     pub observed: Vec<ExprId>,
     /// Location of the rig's frame.
-    pub framed: Option<Framed>,
+    pub framed: Option<RigFrame>,
     /// Errors and warnings.
     pub diagnostics: Vec<Diagnostic>,
 }
 
 /// Flattens an instance.
-pub fn flatten(loaded: &Loaded, sources: &dyn Sources, request: &Request) -> Flat {
+pub fn flatten(loaded: &Loaded, sources: &dyn Sources, request: &Request) -> Flattened {
     let mut f = Flattener::new(loaded, sources);
     for (name, table, unit) in &request.data {
         let number = f.system.tables.len() as u32;
@@ -129,8 +129,13 @@ pub fn flatten(loaded: &Loaded, sources: &dyn Sources, request: &Request) -> Fla
             f.written(instance, &env, overrides);
         }
         Instance::Alone(model, file) | Instance::WithDefaults(model, file) => {
-            let made =
-                Making { path: String::new(), rotary: false, span: model.name.span, args: Vec::new(), overrides };
+            let made = Instantiation {
+                path: String::new(),
+                rotary: false,
+                span: model.name.span,
+                args: Vec::new(),
+                overrides,
+            };
             f.instantiate(model, *file, made, true);
             if let (Instance::WithDefaults(..), Some(top)) = (&request.instance, f.instances.first_mut()) {
                 top.defaults = true;
@@ -169,11 +174,11 @@ pub fn flatten(loaded: &Loaded, sources: &dyn Sources, request: &Request) -> Fla
         // The system of a refused program is not used.
         f.system = System::default();
     }
-    Flat { system: f.system, observed, framed, diagnostics: f.diagnostics }
+    Flattened { system: f.system, observed, framed, diagnostics: f.diagnostics }
 }
 
 /// Flattens a function, constant or table on its own; a function's arguments are given from outside.
-pub fn flatten_item(loaded: &Loaded, sources: &dyn Sources, file: FileId, item: &Item) -> Flat {
+pub fn flatten_item(loaded: &Loaded, sources: &dyn Sources, file: FileId, item: &Item) -> Flattened {
     let mut f = Flattener { most_nodes: MOST_NODES_OF_ITEM, ..Flattener::new(loaded, sources) };
     let env = Env::file(file);
     let observed = match item {
@@ -214,7 +219,7 @@ pub fn flatten_item(loaded: &Loaded, sources: &dyn Sources, file: FileId, item: 
     if f.too_large {
         f.system = System::default();
     }
-    Flat { system: f.system, observed, framed: None, diagnostics: f.diagnostics }
+    Flattened { system: f.system, observed, framed: None, diagnostics: f.diagnostics }
 }
 
 struct Flattener<'a> {
@@ -334,7 +339,7 @@ struct Change<'a> {
 }
 
 /// Parameters of an instantiation.
-struct Making<'a> {
+struct Instantiation<'a> {
     path: String,
     rotary: bool,
     span: Span,
@@ -407,19 +412,19 @@ fn head(equation: &ast::Equation) -> Span {
 }
 
 /// Kind of definition that an equation gives its quantity.
-enum Wanted {
+enum DefinitionKind {
     Value,
-    Rate { along: Along },
+    Rate { along: PathVariable },
     Next,
 }
 
 /// Variable of differentiation: time, or a state with the span of its name.
-type Along = Option<(VarId, Span)>;
+type PathVariable = Option<(VarId, Span)>;
 
 /// The right side of a derivative equation.
 struct Rate {
     value: ExprId,
-    along: Along,
+    along: PathVariable,
     span: Span,
 }
 

@@ -19,7 +19,7 @@ type Unknown = (Span, String);
 
 /// Memo of derivatives.
 #[derive(Default)]
-struct Known {
+struct Derivatives {
     exprs: HashMap<ExprId, Slope>,
     /// Current depth of recursion.
     depth: usize,
@@ -28,7 +28,7 @@ struct Known {
 impl<'a> Flattener<'a> {
     /// The derivative of an expression as an expression; reports an error if it is unknown.
     pub(super) fn slope(&mut self, of: ExprId, span: Span) -> ExprId {
-        let slope = self.rate(of, &mut Known::default()).map(|slope| match slope {
+        let slope = self.rate(of, &mut Derivatives::default()).map(|slope| match slope {
             // Copied, so that its span is that of the call.
             Some(slope) => self.system.push(self.system.node(slope).clone(), span),
             None => self.system.push(zero(), span),
@@ -41,7 +41,7 @@ impl<'a> Flattener<'a> {
         })
     }
 
-    fn rate(&mut self, id: ExprId, known: &mut Known) -> Result<Slope, Unknown> {
+    fn rate(&mut self, id: ExprId, known: &mut Derivatives) -> Result<Slope, Unknown> {
         if let Some(slope) = known.exprs.get(&id) {
             return Ok(*slope);
         }
@@ -55,7 +55,7 @@ impl<'a> Flattener<'a> {
         slope
     }
 
-    fn rate_of(&mut self, id: ExprId, known: &mut Known) -> Result<Slope, Unknown> {
+    fn rate_of(&mut self, id: ExprId, known: &mut Derivatives) -> Result<Slope, Unknown> {
         let span = self.system.span(id);
         let unknown = |why: &str| Err((span, why.to_string()));
         match self.system.node(id).clone() {
@@ -91,7 +91,7 @@ impl<'a> Flattener<'a> {
         }
     }
 
-    fn rate_of_var(&mut self, var: VarId, span: Span, known: &mut Known) -> Result<Slope, Unknown> {
+    fn rate_of_var(&mut self, var: VarId, span: Span, known: &mut Derivatives) -> Result<Slope, Unknown> {
         let declared = self.system.var(var);
         let name = &declared.path;
         match (&declared.definition, declared.kind) {
@@ -115,7 +115,7 @@ impl<'a> Flattener<'a> {
         a: ExprId,
         b: ExprId,
         span: Span,
-        known: &mut Known,
+        known: &mut Derivatives,
     ) -> Result<Slope, Unknown> {
         let (da, db) = match op {
             BinaryOp::Add | BinaryOp::Subtract | BinaryOp::Multiply | BinaryOp::Divide | BinaryOp::Power => {
@@ -165,7 +165,7 @@ impl<'a> Flattener<'a> {
         builtin: Builtin,
         args: &[ExprId],
         span: Span,
-        known: &mut Known,
+        known: &mut Derivatives,
     ) -> Result<Slope, Unknown> {
         let unknown = |why: &str| Err((span, why.to_string()));
         // Signals that depend on time even if their arguments are constant.

@@ -5,9 +5,9 @@
 use crate::hil::live::Judge;
 use crate::testing::models::{Model, View};
 use crate::testing::rigs;
-use abi::live::{Check, Live, Param, Place};
+use abi::live::{Check, Live, Param, Tunable};
 use abi::rig::{
-    Bus, Cia402, Field, Format, Input, Kind, Message, Mode, Node, Output, Overrun, Plant, Rig, Signal, What,
+    Bus, Cia402, Field, Format, Input, Kind, Message, Mode, Node, Output, Overrun, Plant, Rig, Signal, SignalKind,
 };
 use abi::unit::Unit;
 use abi::{Function, Instance};
@@ -146,7 +146,7 @@ impl Made {
         };
         let (control, plant) = (self.control(modes), plant(modes.len()));
         let (inside, outside) = (control.description().layout.clone(), plant.description().layout.clone());
-        let told = |node: usize| modes[node].map_or(What::Field(0, 0), commanded);
+        let told = |node: usize| modes[node].map_or(SignalKind::Field(0, 0), commanded);
         let signal = |node, what| Signal { node, what };
         let outputs = (0..modes.len()).map(|node| {
             let mode = modes[node].unwrap_or(Mode::Torque);
@@ -157,20 +157,23 @@ impl Made {
             Output { signal, slot, low: -most, high: most, slew, safe: self.safe * most }
         });
         let last = modes.len() - 1;
-        let reads = if modes[last].is_none() { What::Field(1, 0) } else { What::Position };
+        let reads = if modes[last].is_none() { SignalKind::Field(1, 0) } else { SignalKind::Position };
         let input =
             |node, what, i| Input { signal: signal(node, what), slot: inside.inputs.slot(i), start: 0.0, needed: true };
         let seen = |node: usize| -> Vec<(Signal, abi::Slot)> {
             let speed = outside.outputs.slot(1);
             match modes[node] {
                 Some(_) => {
-                    vec![(signal(node, What::Position), outside.outputs.slot(0)), (signal(node, What::Speed), speed)]
+                    vec![
+                        (signal(node, SignalKind::Position), outside.outputs.slot(0)),
+                        (signal(node, SignalKind::Speed), speed),
+                    ]
                 }
-                None => vec![(signal(node, What::Field(1, 0)), speed)],
+                None => vec![(signal(node, SignalKind::Field(1, 0)), speed)],
             }
         };
         let applied = |node: usize| {
-            let what = if modes[node].is_none() { What::Field(0, 0) } else { What::Torque };
+            let what = if modes[node].is_none() { SignalKind::Field(0, 0) } else { SignalKind::Torque };
             (signal(node, what), outside.inputs.slot(node))
         };
         let bus = |name: &str| Bus { name: name.into(), address: format!("sim:{name}"), bit_rate: 1_000_000 };
@@ -179,7 +182,7 @@ impl Made {
             name: "space".into(),
             buses,
             nodes: (0..modes.len()).map(|node| self.node(node, modes[node])).collect(),
-            inputs: vec![input(0, What::Speed, 0), input(last, reads, 1)],
+            inputs: vec![input(0, SignalKind::Speed, 0), input(last, reads, 1)],
             outputs: outputs.collect(),
             overrun: if self.hold == 0 { Overrun::Stop } else { Overrun::Hold(self.hold) },
             plant: Plant {
@@ -272,7 +275,7 @@ pub fn judge(control: &Instance) -> Judge {
         path: path.into(),
         unit: Unit::parse("1").expect("a unit that is known"),
         boolean: false,
-        place: Place::Live(inside.params.slot(TWINS[i]), judged.params.slot(i)),
+        place: Tunable::Live(inside.params.slot(TWINS[i]), judged.params.slot(i)),
     };
     let live = Live {
         params: vec![param(0, "first"), param(1, "second")],
@@ -282,11 +285,11 @@ pub fn judge(control: &Instance) -> Judge {
 }
 
 /// The signal that a mode commands.
-pub fn commanded(mode: Mode) -> What {
+pub fn commanded(mode: Mode) -> SignalKind {
     match mode {
-        Mode::Torque => What::Torque,
-        Mode::Speed => What::Speed,
-        Mode::Position => What::Position,
+        Mode::Torque => SignalKind::Torque,
+        Mode::Speed => SignalKind::Speed,
+        Mode::Position => SignalKind::Position,
     }
 }
 
