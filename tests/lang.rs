@@ -194,6 +194,7 @@ files! { rigs steps units derivatives delay sampled regimes parts functions expe
 /// Cases whose text contains several errors, each with a message of its own.
 const SEVERAL: &[&str] = &[
     "a-division-in-a-range",
+    "a-measure-over-time",
     "a-mistake-does-not-hide-the-next-model",
     "a-name-in-foreign-letters",
     "a-name-that-the-instance-does-not-have",
@@ -208,6 +209,7 @@ const SEVERAL: &[&str] = &[
     "an-expectation-in-another-unit",
     "an-odd-negative-power-has-a-sign",
     "an-unknown-function",
+    "axes-of-a-plot",
     "each-unknown-name-is-reported",
     "inf-true-and-false-cannot-be-declared",
     "mistakes-are-found-each-by-itself",

@@ -37,7 +37,9 @@ fn blocks(page: &str) -> Vec<Block> {
 
 /// The failures of a block: lines of diagnostics, and experiments that fail.
 fn wrong(block: &Block) -> Vec<String> {
-    let sources = Texts(vec![("shaft.dbc".into(), include_str!("../examples/rtfs/shaft.dbc").into())]);
+    let recording = "t [s],v [mm/s]\n0,0\n1,5\n2,3\n";
+    let dbc = include_str!("../examples/rtfs/shaft.dbc");
+    let sources = Texts(vec![("shaft.dbc".into(), dbc.into()), ("pull.csv".into(), recording.into())]);
     let (mut loaded, found) = checked("page.fric", &block.text, &sources);
     let mut out: Vec<String> = found.iter().map(|diagnostic| line(&loaded, diagnostic)).collect();
     if !found.iter().any(|diagnostic| diagnostic.is_error()) {

@@ -36,6 +36,51 @@ pub struct Plot {
     pub series: Vec<Series>,
     /// Quantity on the horizontal axis; `None`: time.
     pub against: Option<Series>,
+    /// How it is drawn.
+    pub view: View,
+}
+
+/// How a plot is drawn. Nothing of it changes the run.
+#[derive(Clone, PartialEq, Debug, Default)]
+pub struct View {
+    /// Above the axes.
+    pub title: Option<String>,
+    /// Points from this time on, in s.
+    pub after: Option<f64>,
+    /// Points up to this time, in s.
+    pub before: Option<f64>,
+    /// How each quantity on the vertical axis looks: as many as it has curves.
+    pub looks: Vec<Look>,
+    /// How the horizontal axis looks.
+    pub x: Look,
+    /// For measures over a parameter: then the plot has no series.
+    pub across: Option<Across>,
+}
+
+/// How a quantity of a plot looks.
+#[derive(Clone, PartialEq, Debug, Default)]
+pub struct Look {
+    /// In place of the expression.
+    pub label: Option<String>,
+    /// Ends of its axis in SI.
+    pub range: Option<(f64, f64)>,
+    /// Whether its axis is logarithmic.
+    pub logarithmic: bool,
+    /// Whether it was measured: it depends on columns of a recording alone.
+    pub recorded: bool,
+}
+
+/// Measures of a run over a parameter: one point of a curve for each case of a sweep.
+#[derive(Clone, PartialEq, Debug)]
+pub struct Across {
+    /// The shown measures among [`Experiment::expects`], one for each curve.
+    pub measures: Vec<usize>,
+    /// The parameter as written: `vp`.
+    pub label: String,
+    /// Its value in this case, in SI.
+    pub value: f64,
+    /// The unit it is shown in.
+    pub unit: Unit,
 }
 
 /// An expectation.

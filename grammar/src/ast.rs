@@ -490,17 +490,41 @@ pub enum SweepOver {
 pub struct Data {
     pub file: Text,
     /// A column called `_` is skipped.
-    pub columns: Vec<Argument>,
+    pub columns: Vec<Column>,
     pub span: Span,
 }
 
-/// `plot x [m], r [m] against t [s]`
+/// `x [mm] = "Position"`: a column of a recording. Without a unit it has that of the heading.
+#[derive(Clone, PartialEq, Debug)]
+#[allow(missing_docs)]
+pub struct Column {
+    pub name: Name,
+    pub unit: Option<UnitText>,
+    /// Its heading in the file; without one it is found by its name or by its place.
+    pub heading: Option<Text>,
+}
+
+/// `plot x [m], r [m] against t [s] after 1 s before 2 s title "(a)"`
 #[derive(Clone, PartialEq, Debug)]
 #[allow(missing_docs)]
 pub struct Plot {
-    pub shows: Vec<Show>,
-    pub against: Option<Show>,
+    pub curves: Vec<Curve>,
+    pub against: Option<Curve>,
+    pub after: Option<Expr>,
+    pub before: Option<Expr>,
+    pub title: Option<Text>,
     pub span: Span,
+}
+
+/// `x [mm] as "position" in 0 mm .. 5 mm log`: a quantity of a plot, and how its axis looks.
+#[derive(Clone, PartialEq, Debug)]
+#[allow(missing_docs)]
+pub struct Curve {
+    pub show: Show,
+    pub label: Option<Text>,
+    /// The ends of its axis.
+    pub range: Option<(Expr, Expr)>,
+    pub log: bool,
 }
 
 /// An expression with its display unit.

@@ -505,7 +505,7 @@ impl<'s, 't> Layout<'s, 't> {
                     let signal = matches!(self.source.word(start), "send" | "read");
                     let wire = self.kind(line).0 == "equation";
                     let fits = match word {
-                        "in" => true,
+                        "in" => self.source.word(start) != "plot",
                         "limit" | "slew" => wire,
                         _ => signal,
                     };

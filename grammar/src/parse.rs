@@ -776,14 +776,19 @@ impl<'t> Reader<'t> {
                 Rule::sweep => ExperimentStatement::Sweep(self.sweep(pair)),
                 Rule::data => ExperimentStatement::Data(Data {
                     file: self.string(children.one()),
-                    columns: children.all(Rule::column).into_iter().map(|column| self.argument(column)).collect(),
+                    columns: children.all(Rule::column).into_iter().map(|column| self.column(column)).collect(),
                     span,
                 }),
                 Rule::plot => {
-                    let last = says(&pair, Rule::kw_against);
-                    let mut shows = self.shows(&mut children);
-                    let against = if last { shows.pop() } else { None };
-                    ExperimentStatement::Plot(Plot { shows, against, span })
+                    let [last, after, before] =
+                        [Rule::kw_against, Rule::kw_after, Rule::kw_before].map(|word| says(&pair, word));
+                    let curves = children.all(Rule::curve).into_iter();
+                    let mut curves: Vec<Curve> = curves.map(|curve| self.curve(curve)).collect();
+                    let against = if last { curves.pop() } else { None };
+                    let after = after.then(|| self.value(&mut children));
+                    let before = before.then(|| self.value(&mut children));
+                    let title = children.maybe(Rule::string).map(|title| self.string(title));
+                    ExperimentStatement::Plot(Plot { curves, against, after, before, title, span })
                 }
                 Rule::expect => ExperimentStatement::Expect(self.expect(pair)),
                 Rule::shown => {
@@ -940,6 +945,22 @@ impl<'t> Reader<'t> {
     fn argument(&self, pair: Pair<Rule>) -> Argument {
         let mut children = Children::of(pair);
         Argument { name: self.name(children.one()), unit: self.maybe_unit(&mut children) }
+    }
+
+    fn column(&self, pair: Pair<Rule>) -> Column {
+        let mut children = Children::of(pair);
+        let (name, unit) = (self.name(children.one()), self.maybe_unit(&mut children));
+        children.maybe(Rule::eq);
+        Column { name, unit, heading: children.maybe(Rule::string).map(|heading| self.string(heading)) }
+    }
+
+    fn curve(&mut self, pair: Pair<'t, Rule>) -> Curve {
+        let (range, log) = (says(&pair, Rule::kw_in), says(&pair, Rule::kw_log));
+        let mut children = Children::of(pair);
+        let show = self.shows(&mut children).remove(0);
+        let label = children.maybe(Rule::string).map(|label| self.string(label));
+        let range = range.then(|| (self.value(&mut children), self.value(&mut children)));
+        Curve { show, label, range, log }
     }
 
     /// The next expression, after an optional equals sign.

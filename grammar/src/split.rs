@@ -110,9 +110,9 @@ const STARTERS: [&str; 15] = [
 const DECLARERS: [&str; 11] =
     ["param", "input", "output", "state", "let", "part", "const", "bus", "drive", "device", "sweep"];
 /// Words that continue a statement even at the start of a line.
-const CONTINUATIONS: [&str; 25] = [
+const CONTINUATIONS: [&str; 27] = [
     "then", "else", "and", "or", "in", "crosses", "rises", "falls", "initial", "for", "by", "after", "before",
-    "against", "step", "tol", "limit", "slew", "at", "byte", "as", "scale", "from", "message", "when",
+    "against", "step", "tol", "limit", "slew", "at", "byte", "as", "scale", "from", "message", "when", "title", "log",
 ];
 
 /// Whether `word` begins an item.

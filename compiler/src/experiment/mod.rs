@@ -9,6 +9,7 @@ pub mod vary;
 use crate::analysis::linearise::{OpenPorts, PortSlots, Ports, open};
 use crate::analysis::parameter_checks;
 use crate::codegen::elementary::Alone;
+use crate::frontend::columns::Selector as Column;
 use crate::frontend::delays;
 use crate::frontend::flatten::{Instance, Override, OverrideValue, Request, flatten};
 use crate::frontend::resolve::Loaded;
@@ -114,6 +115,8 @@ struct Statements<'a> {
     expects: Vec<&'a ast::Expect>,
     /// `allow discretisation`
     stepped: bool,
+    /// Names of all lints that it allows.
+    allowed: Vec<&'a str>,
 }
 
 /// A change by a sweep or from outside.
@@ -332,7 +335,7 @@ fn parts<'a>(
 ) -> Option<Statements<'a>> {
     let mut run: Option<&ast::Run> = None;
     let mut parts = (None, Vec::new(), None, Vec::new(), Vec::new());
-    let mut stepped = false;
+    let (mut stepped, mut allowed) = (false, Vec::new());
     let mut twice = |what: &str, span: Span, first: Span| {
         let error = Diagnostic::error("E0301", format!("an experiment has one `{what}`"))
             .label(span, "again here")
@@ -356,7 +359,10 @@ fn parts<'a>(
             },
             ExperimentStatement::Plot(one) => parts.3.push(one),
             ExperimentStatement::Expect(one) => parts.4.push(one),
-            ExperimentStatement::Allow(allow) => stepped |= allow.lint.text == "discretisation",
+            ExperimentStatement::Allow(allow) => {
+                stepped |= allow.lint.text == "discretisation";
+                allowed.push(allow.lint.text.as_str());
+            }
         }
     }
     let Some(run) = run else {
@@ -369,7 +375,7 @@ fn parts<'a>(
         return None;
     };
     let (solver, sweeps, data, plots, expects) = parts;
-    Some(Statements { span: experiment.span, run, solver, sweeps, data, plots, expects, stepped })
+    Some(Statements { span: experiment.span, run, solver, sweeps, data, plots, expects, stepped, allowed })
 }
 
 /// Columns of a recording as tables over time.
@@ -382,51 +388,70 @@ fn recording(
 ) -> Option<Vec<(String, Table, Unit)>> {
     let Some(time) = data.columns.iter().position(|column| column.name.text == "t") else {
         let error = Diagnostic::error("E0903", "a recording needs a column `t`").label(data.span, "no column is time");
-        diagnostics.push(error.help("name the columns in the order of the file, as in `(t [s], x [mm])`"));
+        let help =
+            "name the columns in the order of the file or by their headings, as in `(t [s], x [mm] = \"Position\")`";
+        diagnostics.push(error.help(help));
         return None;
     };
-    let mut out = Vec::new();
-    let mut unit = |column: &ast::Argument| match column.unit.as_ref().map(|text| (text, Unit::parse(&text.text))) {
-        None => Some(Unit::none()),
-        Some((_, Ok(unit))) => Some(unit),
-        Some((text, Err(part))) => {
-            diagnostics
-                .push(Diagnostic::error("E0102", format!("unknown unit `{part}`")).label(text.span, "not known"));
-            None
-        }
-    };
-    let mut units = Vec::new();
-    let mut columns = Vec::new();
+    let mut wanted = Vec::new();
     for (k, column) in data.columns.iter().enumerate() {
-        if column.name.text == "_" {
-            units.push(None);
-            continue;
+        let name = column.name.text.as_str();
+        let twin = data.columns[..k].iter().find(|other| other.name.text == name && name != "_");
+        if let Some(twin) = twin {
+            let error = Diagnostic::error("E0903", format!("two columns are called `{name}`"))
+                .label(column.name.span, "again here")
+                .label(twin.name.span, "first here");
+            diagnostics.push(error.help("name a column that is not used `_`"));
+            return None;
         }
-        let unit = unit(column)?;
-        units.push(Some(unit.clone()));
-        columns.push((k, column, unit));
+        let unit = match column.unit.as_ref().map(|text| (text, Unit::parse(&text.text))) {
+            None => None,
+            Some((_, Ok(unit))) => Some(unit),
+            Some((text, Err(part))) => {
+                let error = Diagnostic::error("E0102", format!("unknown unit `{part}`"));
+                diagnostics.push(error.label(text.span, "not known"));
+                return None;
+            }
+        };
+        let one = match &column.heading {
+            Some(heading) => Column::Headed(&heading.text),
+            None if name == "_" => Column::Unused,
+            None => Column::Named(name),
+        };
+        wanted.push((one, unit));
     }
-    let mut values = columns_of(loaded, sources, root, &data.file, &units, diagnostics)?;
-    let t = std::mem::take(&mut values[time]);
-    values[time].clone_from(&t);
-    if let Some(row) = (1..t.len()).find(|&row| t[row].partial_cmp(&t[row - 1]) != Some(std::cmp::Ordering::Greater)) {
-        let error = Diagnostic::error("E0903", "the times of a recording must increase")
-            .label(data.file.span, format!("row {} is not after the one before", row + 1));
-        diagnostics.push(error);
+    let mut values = columns_of(loaded, sources, root, &data.file, &wanted, diagnostics)?;
+    let seconds = Dimension::of([0, 0, 1, 0, 0]);
+    let (t, unit) = &values[time];
+    if unit.dimension != seconds {
+        let column = &data.columns[time];
+        let is = if unit.dimension.is_none() { "no unit".to_string() } else { format!("{unit}") };
+        let error = Diagnostic::error("E0903", "the column `t` of a recording is a time").label(column.name.span, is);
+        diagnostics.push(error.help("write its unit, as in `t [s]` or `t [ms]`"));
         return None;
     }
-    for (k, column, unit) in columns {
+    let t = t.clone();
+    if let Some(row) = (1..t.len()).find(|&row| t[row].partial_cmp(&t[row - 1]) != Some(std::cmp::Ordering::Greater)) {
+        let shown = |t: f64| format!("{} {unit}", unit.from_si(t));
+        let label = format!("row {}: {} after {}", row + 1, shown(t[row]), shown(t[row - 1]));
+        let error = Diagnostic::error("E0903", "the times of a recording must increase").label(data.file.span, label);
+        diagnostics.push(error.help("is `t` the column that was meant? Sort the rows, and keep one for each time"));
+        return None;
+    }
+    let named = data.columns.iter().zip(values.drain(..)).filter(|(column, _)| column.name.text != "_");
+    let table = |(column, (y, unit)): (&ast::Column, (Vec<f64>, Unit))| {
+        let name = column.name.text.clone();
         let table = Table {
-            name: format!("data.{}", column.name.text),
-            x_dimension: Dimension::of([0, 0, 1, 0, 0]),
+            name: format!("data.{name}"),
+            x_dimension: seconds,
             y_dimension: unit.dimension,
             smooth: false,
             x: t.clone(),
-            y: values[k].clone(),
+            y,
         };
-        out.push((column.name.text.clone(), table, unit));
-    }
-    Some(out)
+        (name, table, unit)
+    };
+    Some(named.map(table).collect())
 }
 
 /// The values of each sweep `first .. last by step` as literals.
@@ -542,12 +567,18 @@ struct ExpectAt {
     before: Option<usize>,
 }
 
+/// The same of a quantity of a plot.
+struct CurveAt {
+    value: usize,
+    range: Option<(usize, usize)>,
+}
+
 #[allow(clippy::too_many_arguments)]
-fn variant(
+fn variant<'a>(
     loaded: &Loaded,
     sources: &dyn Sources,
     name: &str,
-    parts: &Statements,
+    parts: &Statements<'a>,
     prepared: Option<&LoadedRig>,
     data: &[(String, Table, Unit)],
     overrides: Vec<Override>,
@@ -559,20 +590,26 @@ fn variant(
     let root = loaded.root();
     // All expressions of the experiment are flattened together with the instance, then picked out by index.
     let mut observed: Vec<&Expr> = Vec::new();
-    let mut add = |expr| {
+    let mut add = |expr: &'a Expr| {
         observed.push(expr);
         observed.len() - 1
     };
     let duration = parts.run.duration.as_ref().map(&mut add);
     let step = parts.solver.and_then(|s| s.step.as_ref()).map(&mut add);
     let tol = parts.solver.and_then(|solver| solver.tol.as_ref()).map(&mut add);
-    let plots: Vec<(Vec<usize>, Option<usize>)> = parts
+    let mut curve = |curve: &'a ast::Curve| CurveAt {
+        value: add(&curve.show.value),
+        range: curve.range.as_ref().map(|(from, to)| (add(from), add(to))),
+    };
+    let plots: Vec<(Vec<CurveAt>, Option<CurveAt>)> = parts
         .plots
         .iter()
-        .map(|plot| {
-            let shows = plot.shows.iter().map(|show| add(&show.value)).collect();
-            (shows, plot.against.as_ref().map(|show| add(&show.value)))
-        })
+        .map(|plot| (plot.curves.iter().map(&mut curve).collect(), plot.against.as_ref().map(&mut curve)))
+        .collect();
+    let windows: Vec<(Option<usize>, Option<usize>)> = parts
+        .plots
+        .iter()
+        .map(|plot| (plot.after.as_ref().map(&mut add), plot.before.as_ref().map(&mut add)))
         .collect();
     let expects: Vec<ExpectAt> = parts
         .expects
@@ -626,8 +663,18 @@ fn variant(
     }
     diagnostics.retain(|d| d.is_error() || !outside_of(parts.span, d));
     let (places, vary) = (Vec::new(), &start_values::params(&system, &given.vary)[..]);
-    let mut reader =
-        Reader { loaded, system: &system, types: &types, diagnostics, wanted: Vec::new(), places, vary, expect: 0 };
+    let recorded = data.iter().map(|(_, table, unit)| (table.name.clone(), unit.clone())).collect();
+    let mut reader = Reader {
+        loaded,
+        recorded,
+        system: &system,
+        types: &types,
+        diagnostics,
+        wanted: Vec::new(),
+        places,
+        vary,
+        expect: 0,
+    };
     if let Some(cut) = &cut {
         reader.wanted = cut.wanted(&system);
     }
@@ -669,16 +716,16 @@ fn variant(
                 .push(error.help("run a shorter time or take longer steps: a trillion of them is the limit"));
         }
     }
-    let mut series_at: Vec<(Vec<usize>, Option<usize>)> = Vec::new();
-    for (plot, (shows, against)) in parts.plots.iter().zip(&plots) {
-        let shows = plot.shows.iter().zip(shows).map(|(show, at)| reader.show(show, nodes[*at])).collect();
-        let against = plot.against.as_ref().zip(*against).map(|(show, at)| reader.show(show, nodes[at]));
-        series_at.push((shows, against));
-    }
+    reader.recording_ends(parts, data, duration, warnings);
     let mut expects_at = Vec::new();
     for (k, (expect, at)) in parts.expects.iter().zip(&expects).enumerate() {
         reader.expect = k;
         expects_at.push(reader.expect(expect, at, &nodes, duration));
+    }
+    let mut plots_at: Vec<PlotAt> = Vec::new();
+    for ((plot, (curves, against)), window) in parts.plots.iter().zip(&plots).zip(windows) {
+        let at = reader.plot(plot, (curves, against.as_ref()), window, &nodes, duration, &mut expects_at);
+        plots_at.extend(at);
     }
     let ports_at: Vec<usize> = ports.outputs.iter().map(|(_, node)| reader.want(*node, None)).collect();
     let (wanted, diagnostics) = (std::mem::take(&mut reader.wanted), std::mem::take(&mut reader.diagnostics));
@@ -727,13 +774,12 @@ fn variant(
         unit: wanted[at].unit.clone().unwrap_or_default(),
         boolean: types.boolean[wanted[at].expr.0 as usize],
     };
-    let plots = series_at
-        .iter()
-        .map(|(shows, against)| plan::Plot {
-            series: shows.iter().map(|at| series(*at)).collect(),
-            against: against.map(series),
-        })
-        .collect();
+    let plots = plots_at.into_iter().map(|plot| plan::Plot {
+        series: plot.series.iter().map(|at| series(*at)).collect(),
+        against: plot.against.map(series),
+        view: plot.view,
+    });
+    let plots = plots.collect();
     let expects = expects_at
         .into_iter()
         .flatten()
@@ -833,8 +879,17 @@ fn surface_text(loaded: &Loaded, place: &str) -> String {
     parse().unwrap_or_else(|| place.to_string())
 }
 
+/// A plot whose quantities are indices of observed expressions.
+struct PlotAt {
+    series: Vec<usize>,
+    against: Option<usize>,
+    view: plan::View,
+}
+
 struct Reader<'a> {
     loaded: &'a Loaded,
+    /// Units of the columns of the recording, by table.
+    recorded: Vec<(String, Unit)>,
     system: &'a System,
     types: &'a Types,
     diagnostics: Vec<Diagnostic>,
@@ -967,7 +1022,11 @@ impl Reader<'_> {
             Node::Time => Unit::parse("s").expect("the second is known"),
             Node::Call(Builtin::Abs, args) => self.own_unit(args[0]),
             Node::Negate(a) => self.own_unit(*a),
-            Node::Table(table, _) => Unit::si(self.system.tables[*table as usize].y_dimension),
+            Node::Table(table, _) => {
+                let table = &self.system.tables[*table as usize];
+                let recorded = self.recorded.iter().find(|(name, _)| *name == table.name);
+                recorded.map_or_else(|| Unit::si(table.y_dimension), |(_, unit)| unit.clone())
+            }
             Node::Binary(BinaryOp::Add | BinaryOp::Subtract, a, b) => {
                 let (a, b) = (self.own_unit(*a), self.own_unit(*b));
                 if a == b { a } else { Unit::si(self.dimension(expr)) }
@@ -980,7 +1039,9 @@ impl Reader<'_> {
     /// The display unit stated for an expression, if its dimension matches.
     fn unit_for(&mut self, expr: ExprId, text: &ast::UnitText) -> Option<Unit> {
         match Unit::parse(&text.text) {
-            Ok(unit) if unit.dimension == self.dimension(expr) || self.types.boolean[expr.0 as usize] => Some(unit),
+            // A condition is true or false, whatever unit stands beside it.
+            Ok(_) if self.types.boolean[expr.0 as usize] => Some(Unit::none()),
+            Ok(unit) if unit.dimension == self.dimension(expr) => Some(unit),
             Ok(unit) => {
                 let message = format!("this is {}, it cannot be shown in {unit}", self.dimension(expr).describe());
                 let error = Diagnostic::error("E0101", message)
@@ -1021,13 +1082,183 @@ impl Reader<'_> {
         }
     }
 
+    /// Tells that a run reads a recording outside of its times, where it is held.
+    fn recording_ends(
+        &mut self,
+        parts: &Statements,
+        data: &[(String, Table, Unit)],
+        duration: f64,
+        told: &[Diagnostic],
+    ) {
+        let (Some(statement), Some((_, table, _))) = (parts.data, data.first()) else { return };
+        let (Some(&from), Some(&to)) = (table.x.first(), table.x.last()) else { return };
+        // A grid of decimals may end a rounding error before the duration.
+        let ends = to < duration * (1.0 - 1e-9);
+        if parts.allowed.contains(&"recording-ends") || !(ends || from > 0.0) {
+            return;
+        }
+        let time = |t: f64| format!("{} s", abi::format::three_digits(t));
+        let (message, label) = match (from > 0.0, ends) {
+            (false, _) => ("the recording ends before the run".to_string(), format!("ends at {}", time(to))),
+            (true, false) => ("the recording begins after the run".to_string(), format!("begins at {}", time(from))),
+            (true, true) => {
+                ("the recording covers only a part of the run".to_string(), format!("{} to {}", time(from), time(to)))
+            }
+        };
+        let label = format!("{label}; outside, its first and last rows are held");
+        let warning = Diagnostic::warning("W0901", message)
+            .label(statement.file.span, label)
+            .label(parts.run.span, format!("from 0 s to {}", time(duration)));
+        let help = match from > 0.0 {
+            true => "subtract the first time from `t` in the file, or `allow recording-ends \"…\"`".to_string(),
+            false => format!("run `for {}`, or leave `for` out: then the run ends with the recording", time(to)),
+        };
+        // The cases of a sweep read the same recording.
+        if !told.iter().any(|one| one.code == warning.code && one.span() == warning.span()) {
+            self.diagnostics.push(warning.help(help));
+        }
+    }
+
+    /// Reads a plot; `across` a parameter, its measures become shown expectations.
+    fn plot(
+        &mut self,
+        plot: &ast::Plot,
+        (curves, against): (&[CurveAt], Option<&CurveAt>),
+        window: (Option<usize>, Option<usize>),
+        nodes: &[ExprId],
+        duration: f64,
+        expects: &mut Vec<Option<plan::Expect>>,
+    ) -> Option<PlotAt> {
+        let mut time = |at: Option<usize>| match at {
+            Some(at) if self.constant(nodes[at]) == 0.0 => Some(0.0),
+            at => at.map(|at| self.time(nodes[at], "a window")),
+        };
+        let (after, before) = (time(window.0), time(window.1));
+        let (from, to) = (after.unwrap_or(0.0), before.unwrap_or(duration).min(duration));
+        if from >= to && (after.is_some() || before.is_some()) {
+            let error = Diagnostic::error("E0902", "the window of this plot is empty")
+                .label(plot.span, format!("from {from} s to {to} s"));
+            self.diagnostics.push(error.help(format!("the run takes {duration} s")));
+            return None;
+        }
+        let looks = plot.curves.iter().zip(curves).map(|(curve, at)| self.look(curve, at, nodes)).collect();
+        let x = plot.against.as_ref().zip(against).map(|(curve, at)| self.look(curve, at, nodes)).unwrap_or_default();
+        let title = plot.title.as_ref().map(|title| title.text.clone());
+        let mut view = plan::View { title, after, before, looks, x, across: None };
+        let measures = curves.iter().filter(|at| self.measured(nodes[at.value])).count();
+        if measures == 0 {
+            let series = plot.curves.iter().zip(curves);
+            let series = series.map(|(curve, at)| self.show(&curve.show, nodes[at.value])).collect();
+            let against = plot.against.as_ref().zip(against);
+            let against = against.map(|(curve, at)| self.show(&curve.show, nodes[at.value]));
+            return Some(PlotAt { series, against, view });
+        }
+        let measured = curves.iter().find(|at| self.measured(nodes[at.value]));
+        let span = self.system.span(nodes[measured.expect("there is one").value]);
+        let Some((parameter, at)) = plot.against.as_ref().zip(against) else {
+            let error = Diagnostic::error("E0901", "a measure is one number for the whole run")
+                .label(span, "plotted over time");
+            let help = "test it with `expect`, or plot it against what a `sweep` varies: `plot max(F) against vp`";
+            self.diagnostics.push(error.help(help));
+            return None;
+        };
+        if measures < curves.len() {
+            let other = curves.iter().find(|at| !self.measured(nodes[at.value])).expect("there is one");
+            let error = Diagnostic::error("E0901", "a plot shows measures or quantities, not both")
+                .label(span, "one number for the whole run")
+                .label(self.system.span(nodes[other.value]), "a number at each time");
+            self.diagnostics.push(error.help("write two `plot`s"));
+            return None;
+        }
+        let value = self.constant(nodes[at.value]);
+        if !value.is_finite() || self.measured(nodes[at.value]) {
+            let error = Diagnostic::error("E0901", "a measure is plotted against a parameter")
+                .label(self.system.span(nodes[at.value]), "not one number that is known before the run");
+            self.diagnostics.push(error.help("`sweep` a parameter, and write its path here"));
+            return None;
+        }
+        let unit = parameter.show.unit.as_ref().and_then(|text| self.unit_for(nodes[at.value], text));
+        let unit = unit.unwrap_or_else(|| self.own_unit(nodes[at.value]));
+        let label = one_line(self.loaded.files.slice(parameter.show.value.span));
+        let mut across = plan::Across { measures: Vec::new(), label, value, unit };
+        for (curve, at) in plot.curves.iter().zip(curves) {
+            let shown = ast::Expect {
+                value: curve.show.value.clone(),
+                near: None,
+                shows: Some(curve.show.unit.clone()),
+                after: plot.after.clone(),
+                before: plot.before.clone(),
+                span: curve.show.span,
+            };
+            let at = ExpectAt { value: at.value, near: None, after: window.0, before: window.1 };
+            self.expect = expects.len();
+            let expect = self.expect(&shown, &at, nodes, duration);
+            across.measures.push(expects.len());
+            expects.push(expect);
+        }
+        view.across = Some(across);
+        Some(PlotAt { series: Vec::new(), against: None, view })
+    }
+
+    /// How a quantity of a plot looks.
+    fn look(&mut self, curve: &ast::Curve, at: &CurveAt, nodes: &[ExprId]) -> plan::Look {
+        let node = nodes[at.value];
+        let range = at.range.and_then(|(from, to)| self.axis_range(node, curve.log, nodes[from], nodes[to]));
+        plan::Look {
+            label: curve.label.as_ref().map(|label| label.text.clone()),
+            range,
+            logarithmic: curve.log,
+            recorded: self.is_recorded(node) == Some(true),
+        }
+    }
+
+    /// The ends of an axis, in SI; 0 fits every unit.
+    fn axis_range(&mut self, of: ExprId, log: bool, from: ExprId, to: ExprId) -> Option<(f64, f64)> {
+        let wanted = self.dimension(of);
+        for end in [from, to] {
+            let (found, value, span) = (self.dimension(end), self.constant(end), self.system.span(end));
+            let text = self.loaded.files.slice(span);
+            let error = if !value.is_finite() {
+                Diagnostic::error("E0902", "the ends of an axis are known before the run").label(span, "not constant")
+            } else if found == wanted || value == 0.0 {
+                continue;
+            } else if found.is_none() {
+                Diagnostic::error("E0103", format!("`{text}` needs a unit"))
+                    .label(span, "a pure number")
+                    .help(format!("write `{text} {}`", Unit::si(wanted)))
+            } else {
+                let message = format!("an axis of {} does not end at {}", wanted.describe(), found.describe());
+                Diagnostic::error("E0101", message)
+                    .label(span, Unit::si(found).to_string())
+                    .label(self.system.span(of), Unit::si(wanted).to_string())
+            };
+            self.diagnostics.push(error);
+            return None;
+        }
+        let (low, high) = (self.constant(from), self.constant(to));
+        let problem = match (low < high, log && low <= 0.0) {
+            (false, _) => "an axis goes from its lower to its upper end",
+            (true, true) => "a logarithmic axis begins above 0",
+            (true, false) => return Some((low, high)),
+        };
+        let label = format!("from {low} to {high} in SI");
+        self.diagnostics.push(Diagnostic::error("E0902", problem).label(self.system.span(from), label));
+        None
+    }
+
+    /// Whether an expression reads a recording; `None` if it reads a quantity of the model.
+    fn is_recorded(&self, id: ExprId) -> Option<bool> {
+        match self.system.node(id) {
+            Node::Var(_) | Node::Rate(_) | Node::InRegime(..) => None,
+            Node::Table(table, at) if matches!(self.system.node(*at), Node::Time) => {
+                Some(self.system.tables[*table as usize].name.starts_with("data."))
+            }
+            node => node.operands().try_fold(false, |any, operand| Some(any | self.is_recorded(operand)?)),
+        }
+    }
+
     fn show(&mut self, show: &ast::Show, expr: ExprId) -> usize {
         let unit = show.unit.as_ref().and_then(|text| self.unit_for(expr, text));
-        if let Node::Measure(..) = self.system.node(expr) {
-            let error = Diagnostic::error("E0901", "a measure belongs in `expect`, not in `plot`")
-                .label(self.system.span(expr), "one number for the whole run");
-            self.diagnostics.push(error);
-        }
         self.want(expr, unit)
     }
 

@@ -466,6 +466,7 @@ pub const LINTS: &[(&str, &str)] = &[
     ("bus-load", "W0805"),
     ("dbc-unit", "W0806"),
     ("no-drive-timeout", "W0807"),
+    ("recording-ends", "W0901"),
 ];
 
 impl System {

@@ -2,7 +2,7 @@
 //!
 //! In: a table's syntax tree and [`Sources`]. Out: points in SI units, or diagnostics. Knows nothing of interpolation.
 
-use crate::frontend::columns;
+use crate::frontend::columns::{self, Selector};
 use crate::frontend::resolve::Loaded;
 use crate::frontend::source::Sources;
 use crate::frontend::system::Table;
@@ -42,10 +42,10 @@ pub fn read(
             }
         }
         TablePoints::File(path) => {
-            let units = [Some(x_unit.clone()), Some(y_unit.clone())];
-            let columns = columns(loaded, sources, file, path, &units, diagnostics)?;
-            x.extend(&columns[0]);
-            y.extend(&columns[1]);
+            let wanted = [(Selector::Place, Some(x_unit.clone())), (Selector::Place, Some(y_unit.clone()))];
+            let columns = columns(loaded, sources, file, path, &wanted, diagnostics)?;
+            x.extend(&columns[0].0);
+            y.extend(&columns[1].0);
             for k in 0..x.len() {
                 check_order(&x[..=k], path.span, diagnostics)?;
             }
@@ -66,16 +66,16 @@ pub fn read(
     })
 }
 
-/// The first columns of a file of numbers, one for each of `units`, converted to SI. A unit in the heading overrides
-/// the entry of `units` and must have its dimension. A column whose entry is `None` is not wanted.
+/// Columns of a file of numbers, converted to SI, each with the unit it is shown in. The unit in the heading is that of
+/// the numbers and must have the dimension of the unit wanted; without either, the numbers have no unit.
 pub fn columns(
     loaded: &Loaded,
     sources: &dyn Sources,
     file: FileId,
     path: &ast::Text,
-    units: &[Option<Unit>],
+    wanted: &[(Selector, Option<Unit>)],
     diagnostics: &mut Vec<Diagnostic>,
-) -> Option<Vec<Vec<f64>>> {
+) -> Option<Vec<(Vec<f64>, Unit)>> {
     let from = &loaded.files.get(file).name;
     let text = match sources.file(from, &path.text) {
         Ok((_, text)) => text,
@@ -85,8 +85,8 @@ pub fn columns(
             return None;
         }
     };
-    let wanted: Vec<bool> = units.iter().map(Option::is_some).collect();
-    let read = match columns::read(&text, &wanted) {
+    let names: Vec<Selector> = wanted.iter().map(|(one, _)| *one).collect();
+    let read = match columns::read(&text, &names) {
         Ok(read) => read,
         Err(what) => {
             let error = Diagnostic::error("E0903", format!("\"{}\" does not fit", path.text)).label(path.span, what);
@@ -94,28 +94,28 @@ pub fn columns(
             return None;
         }
     };
-    let first = wanted.iter().position(|wanted| *wanted).unwrap_or(0);
+    let first = names.iter().position(|one| *one != Selector::Unused).unwrap_or(0);
     if read.numbers[first].is_empty() {
         let error = Diagnostic::error("E0902", format!("\"{}\" has no rows", path.text)).label(path.span, "empty");
         diagnostics.push(error);
         return None;
     }
     let mut out = Vec::new();
-    for (k, ((numbers, stated), unit)) in read.numbers.iter().zip(&read.units).zip(units).enumerate() {
-        let Some(unit) = unit else {
-            out.push(Vec::new());
-            continue;
-        };
+    for (k, ((numbers, stated), (_, unit))) in read.numbers.iter().zip(&read.units).zip(wanted).enumerate() {
+        let unit = unit.as_ref().or(stated.as_ref()).cloned().unwrap_or_default();
         if let Some(stated) = stated.as_ref().filter(|stated| stated.dimension != unit.dimension) {
-            let shown = |unit: &Unit| if unit.text.is_empty() { "a pure number".to_string() } else { unit.to_string() };
-            let message =
-                format!("column {} of \"{}\" is in {}, not in {}", k + 1, path.text, shown(stated), shown(unit));
+            let shown = |unit: &Unit| match unit.dimension.is_none() {
+                true => "a pure number".to_string(),
+                false => format!("in {unit}"),
+            };
+            let column = format!("column {} of \"{}\"", read.places[k], path.text);
+            let message = format!("{column} is {}, not {}", shown(stated), shown(&unit));
             let error = Diagnostic::error("E0903", message).label(path.span, "its heading says so");
             diagnostics.push(error.help("change the unit here, the order of the columns, or the heading of the file"));
             return None;
         }
-        let unit = stated.as_ref().unwrap_or(unit);
-        out.push(numbers.iter().map(|number| unit.to_si(*number)).collect());
+        let numbers = numbers.iter().map(|number| stated.as_ref().unwrap_or(&unit).to_si(*number)).collect();
+        out.push((numbers, unit));
     }
     Some(out)
 }

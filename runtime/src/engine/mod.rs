@@ -11,7 +11,7 @@ pub mod lanes;
 pub mod sweep;
 
 use crate::coupling::sil;
-use crate::record::Recording;
+use crate::record::{Recorder, Recording};
 use crate::run::fixed::Fixed;
 use crate::run::observe::{Observer, Probe};
 use crate::run::outcome::Stop;
@@ -77,6 +77,27 @@ pub fn sample(
     let (rest, result) = go(instance, &bare, observer, &mut |_| (), watch);
     let failed = |stop: Stop| Failure { cause: stop.cause, time: stop.time, recording: Recording::default() };
     (rest.observer.probe.values(), result.map_err(failed))
+}
+
+/// Most numbers that a recording of every step holds: 400 MB.
+pub const MOST_NUMBERS: usize = 50_000_000;
+
+/// Repeats the experiment and records its plots at every step, up to where it ended, and how it ended. `None` if that is
+/// more than [`MOST_NUMBERS`].
+///
+/// # Panics
+/// As [`run`].
+pub fn every_step(
+    instance: Instance,
+    experiment: &Experiment,
+    watch: &mut dyn FnMut(f64) -> Continue,
+) -> (Option<Recording>, Result<(), Failure>) {
+    let bare = Experiment { expects: Vec::new(), ..experiment.clone() };
+    let mut observer = Observer::new(&bare);
+    observer.recorder = Recorder::whole(&bare.plots, MOST_NUMBERS);
+    let (rest, result) = go(instance, &bare, observer, &mut |_| (), watch);
+    let failed = |stop: Stop| Failure { cause: stop.cause, time: stop.time, recording: Recording::default() };
+    (rest.observer.recorder.all(), result.map_err(failed))
 }
 
 /// Runs to the end, or to the reason why not.

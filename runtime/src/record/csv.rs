@@ -37,16 +37,28 @@ pub fn save(recording: &Recording, path: &Path) -> io::Result<()> {
 /// Those of the writer.
 pub fn write(recording: &Recording, to: impl Write) -> io::Result<()> {
     let mut csv = ::csv::Writer::from_writer(to);
-    let header = recording.columns().iter().map(|column| match column.boolean {
-        true => column.label.clone(),
-        false => format!("{} [{}]", column.label, column.unit),
-    });
-    csv.write_record(std::iter::once("t [s]".to_string()).chain(header))?;
-    for row in recording.rows() {
-        let shown = recording.columns().iter().zip(&row[1..]).map(|(column, value)| column.unit.from_si(*value));
-        csv.write_record(std::iter::once(row[0]).chain(shown).map(format::plain))?;
+    csv.write_record(headings(recording))?;
+    for row in shown(recording) {
+        csv.write_record(row.map(format::plain))?;
     }
     csv.flush()
+}
+
+/// The heading of each column, beginning with time: `t [s]`, `body.v [mm/s]`, `fr.stick`.
+pub fn headings(recording: &Recording) -> Vec<String> {
+    let heading = |column: &super::Column| match column.boolean {
+        true => column.label.clone(),
+        false => format!("{} [{}]", column.label, column.unit),
+    };
+    std::iter::once("t [s]".to_string()).chain(recording.columns().iter().map(heading)).collect()
+}
+
+/// The rows in the units of the headings.
+pub fn shown(recording: &Recording) -> impl Iterator<Item = impl Iterator<Item = f64>> {
+    recording.rows().map(|row| {
+        let values = recording.columns().iter().zip(&row[1..]).map(|(column, value)| column.unit.from_si(*value));
+        std::iter::once(row[0]).chain(values)
+    })
 }
 
 #[cfg(test)]
@@ -54,7 +66,7 @@ mod tests {
     use super::*;
     use crate::record::Recorder;
     use abi::Slot;
-    use abi::plan::{Plot, Series};
+    use abi::plan::{Plot, Series, View};
     use abi::unit::Unit;
 
     fn recording() -> Recording {
@@ -67,6 +79,7 @@ mod tests {
         let plot = Plot {
             series: vec![series("body.v", 3, "mm/s", false), series("max(a, b)", 4, "1", false)],
             against: Some(series("fr.stick", 5, "1", true)),
+            view: View::default(),
         };
         let mut recorder = Recorder::new(&[plot]);
         recorder.see(0.0, &[0.0, 0.0, 0.0, 0.25, 1.0 / 3.0, 1.0]);

@@ -89,6 +89,10 @@ pub struct Recorder {
     seen: u64,
     /// The last row, which ends the recording.
     last: Vec<f64>,
+    /// For a recording of every point: its rows, and the most numbers that it may hold.
+    every: Option<(Vec<f64>, usize)>,
+    /// Points outside are not kept, in s: no plot shows them.
+    window: (f64, f64),
 }
 
 impl Recorder {
@@ -104,7 +108,21 @@ impl Recorder {
             }
         }
         let last = vec![0.0; slots.len() + 2];
-        Recorder { columns, slots, buckets: Vec::new(), capacity: 1, filled: 1, seen: 0, last }
+        let after = plots.iter().map(|plot| plot.view.after.unwrap_or(f64::NEG_INFINITY));
+        let before = plots.iter().map(|plot| plot.view.before.unwrap_or(f64::INFINITY));
+        let window = (after.fold(f64::INFINITY, f64::min), before.fold(f64::NEG_INFINITY, f64::max));
+        Recorder { columns, slots, buckets: Vec::new(), capacity: 1, filled: 1, seen: 0, last, every: None, window }
+    }
+
+    /// The same, and keeps every point of the run, as long as these are at most `most` numbers.
+    pub fn whole(plots: &[Plot], most: usize) -> Recorder {
+        Recorder { every: Some((Vec::new(), most)), ..Recorder::new(plots) }
+    }
+
+    /// The recording of every point; `None` if it would have been too large.
+    pub fn all(self) -> Option<Recording> {
+        let (numbers, most) = self.every?;
+        (numbers.len() <= most).then_some(Recording { columns: self.columns, numbers, seen: self.seen })
     }
 
     /// A recording of given rows instead of observed points: times in s, ascending, and as many rows of values in SI,
@@ -137,6 +155,15 @@ impl Recorder {
             *value = block[slot.index()];
         }
         self.seen += 1;
+        if let Some((numbers, most)) = &mut self.every {
+            if numbers.len() <= *most {
+                numbers.extend(&self.last[1..]);
+            }
+            return;
+        }
+        if !(t >= self.window.0 && t <= self.window.1) {
+            return;
+        }
         if self.filled < self.capacity {
             self.filled += 1;
             let bucket = self.buckets.len() - self.bucket_len();
@@ -182,7 +209,8 @@ impl Recorder {
             rows.dedup_by_key(|row| row[0]);
             numbers.extend(rows.iter().flat_map(|row| &row[1..]));
         }
-        if self.seen > 0 && !numbers.ends_with(&self.last[1..]) {
+        let last_is_kept = self.last[1] >= self.window.0 && self.last[1] <= self.window.1;
+        if self.seen > 0 && last_is_kept && !numbers.ends_with(&self.last[1..]) {
             numbers.extend(&self.last[1..]);
         }
         Recording { columns: self.columns.clone(), numbers, seen: self.seen }
@@ -207,14 +235,15 @@ fn take(bucket: &mut [f64], row: &[f64]) {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use abi::plan::View;
 
     /// A recorder of two quantities, in slots 3 and 4.
     fn recorder() -> Recorder {
         let series =
             |label: &str, slot| Series { label: label.into(), slot: Slot(slot), unit: Unit::none(), boolean: false };
         Recorder::new(&[
-            Plot { series: vec![series("a", 3), series("b", 4)], against: None },
-            Plot { series: vec![series("a", 3)], against: Some(series("b", 4)) },
+            Plot { series: vec![series("a", 3), series("b", 4)], against: None, view: View::default() },
+            Plot { series: vec![series("a", 3)], against: Some(series("b", 4)), view: View::default() },
         ])
     }
 

@@ -359,7 +359,7 @@ pub fn plot(instance: &Instance, paths: &[&str]) -> Plot {
         unit: instance.description().quantity(path).unwrap().unit.clone(),
         boolean: false,
     };
-    Plot { series: paths.iter().map(series).collect(), against: None }
+    Plot { series: paths.iter().map(series).collect(), against: None, view: Default::default() }
 }
 
 /// A mass of 1 kg pulled through a spring of k = 2 N/m at 0.1 m/s, held by LuGre friction with the parameters of

@@ -525,15 +525,17 @@ impl<'a> Flattener<'a> {
         }
         if function.text == "slope" && !own {
             return match args {
-                [_] if !env.outside => {
-                    let error = Diagnostic::error("E0901", "`slope` belongs in an experiment")
-                        .label(function.span, "follows equations that a model may not know of")
-                        .help("in a model the derivative of a state is written `dx/dt`");
-                    self.report(error);
-                    self.error(span)
-                }
                 [of] => {
                     let of = self.expr(of, env);
+                    // An argument of the run may be the derivative of a signal or of a recording.
+                    let of_signal = env.instance.is_none() && self.of_time_alone(of);
+                    if !(env.outside || of_signal) {
+                        let error = Diagnostic::error("E0901", "`slope` belongs in an experiment")
+                            .label(function.span, "follows equations that a model may not know of")
+                            .help("in a model the derivative of a state is written `dx/dt`");
+                        self.report(error);
+                        return self.error(span);
+                    }
                     self.slope(of, span)
                 }
                 _ => {

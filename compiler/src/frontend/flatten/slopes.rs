@@ -4,6 +4,8 @@
 //! rules of calculus, down to the rates of states, or the subexpression without a known derivative. The derivative
 //! holds between events. Where a quantity jumps it has none, so `sign`, `floor`, ticks and noise are refused rather
 //! than differentiated to 0.
+//!
+//! The derivative of a recording is another recording, of second-order differences of neighbouring samples.
 
 use super::*;
 use crate::functions::{Term, Unary};
@@ -82,6 +84,10 @@ impl<'a> Flattener<'a> {
             },
             Node::Fits { value, .. } => self.rate(value, known),
             Node::Call(builtin, args) => self.rate_of_call(id, builtin, &args, span, known),
+            Node::Table(table, at) if self.data.values().any(|(recorded, _)| *recorded == table) => {
+                let derivative = self.recorded_slope(table);
+                Ok(Some(self.system.push(Node::Table(derivative, at), span)))
+            }
             Node::Table(_, x) => match self.rate(x, known)? {
                 None => Ok(None),
                 Some(_) => unknown("a table or a recording"),
@@ -89,6 +95,27 @@ impl<'a> Flattener<'a> {
             Node::Not(_) | Node::InRegime(..) | Node::Crossing(_) => unknown("a condition is true or false"),
             Node::Measure(..) => unknown("a measure is one number"),
         }
+    }
+
+    /// Whether an expression reads time, recordings and numbers only.
+    pub(super) fn of_time_alone(&self, id: ExprId) -> bool {
+        let node = self.system.node(id);
+        !matches!(node, Node::Var(_) | Node::Rate(_) | Node::PathRate(_) | Node::InRegime(..) | Node::Measure(..))
+            && node.operands().all(|operand| self.of_time_alone(operand))
+    }
+
+    /// The table of the derivative of a recording.
+    fn recorded_slope(&mut self, table: u32) -> u32 {
+        let of = &self.system.tables[table as usize];
+        let name = format!("{}'", of.name);
+        if let Some(known) = self.system.tables.iter().position(|table| table.name == name) {
+            return known as u32;
+        }
+        let y_dimension = of.y_dimension.over(of.x_dimension);
+        let y = differences(&of.x, &of.y);
+        let table = Table { name, x_dimension: of.x_dimension, y_dimension, smooth: false, x: of.x.clone(), y };
+        self.system.tables.push(table);
+        self.system.tables.len() as u32 - 1
     }
 
     fn rate_of_var(&mut self, var: VarId, span: Span, known: &mut Derivatives) -> Result<Slope, Unknown> {
@@ -301,5 +328,50 @@ impl<'a> Flattener<'a> {
 
     fn plain(&mut self, value: f64, span: Span) -> ExprId {
         self.system.push(Node::Number { value, dimension: Some(Dimension::NONE), angle: Angle::Silent }, span)
+    }
+}
+
+/// Derivatives at the samples `x`: of the parabola through a sample and its two neighbours (Fornberg, Math. Comp. 51,
+/// 1988, for three points at any distances), at the ends of the line through the last two.
+fn differences(x: &[f64], y: &[f64]) -> Vec<f64> {
+    let secant = |k: usize| (y[k + 1] - y[k]) / (x[k + 1] - x[k]);
+    let last = x.len() - 1;
+    let at = |k: usize| match k {
+        _ if last == 0 => 0.0,
+        0 => secant(0),
+        k if k == last => secant(k - 1),
+        k => {
+            let (before, after) = (x[k] - x[k - 1], x[k + 1] - x[k]);
+            (secant(k - 1) * after + secant(k) * before) / (before + after)
+        }
+    };
+    (0..=last).map(at).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::differences;
+    use crate::ir::random::Random;
+
+    /// Exact for parabolas at any distances; second order for a sine.
+    #[test]
+    fn differences_of_parabolas_are_exact() {
+        let seed = std::env::var("FRIC_SEED").ok().and_then(|seed| seed.parse().ok()).unwrap_or(5);
+        let mut random = Random(seed);
+        for case in 0..200 {
+            let mut x = vec![random.within(-1.0, 1.0)];
+            for k in 0..20 {
+                x.push(x[k] + random.within(0.01, 0.2));
+            }
+            let [a, b, c] = [0; 3].map(|_| random.within(-2.0, 2.0));
+            let y: Vec<f64> = x.iter().map(|x| a + b * x + c * x * x).collect();
+            for (k, slope) in differences(&x, &y).iter().enumerate().skip(1).take(x.len() - 2) {
+                let exact = b + 2.0 * c * x[k];
+                assert!((slope - exact).abs() < 1e-11, "seed {seed}, case {case}: {slope} for {exact}");
+            }
+        }
+        println!("seed {seed}");
+        assert_eq!(differences(&[1.0], &[3.0]), [0.0]);
+        assert_eq!(differences(&[1.0, 3.0], &[3.0, 4.0]), [0.5, 0.5]);
     }
 }
