@@ -4,6 +4,7 @@
 //! usage and not a failed run.
 
 use crate::compile::{Changes, Emit};
+use crate::plot::{self, Figure, Lines};
 use crate::quantity;
 use crate::vary::{self, Vary};
 use abi::image::{Feature, Target};
@@ -207,6 +208,75 @@ pub struct Timed {
     pub timings: bool,
 }
 
+/// How a figure is drawn.
+#[derive(clap::Args, Clone, Debug, Default)]
+pub struct Look {
+    /// Size of the figure in print, such as 85x60mm; it then has no title unless --title says one
+    #[arg(long, value_name = "WIDTHxHEIGHT", value_parser = size)]
+    pub size: Option<(f64, f64)>,
+    /// Size of its letters, such as 8pt [default: 10pt, and 8pt with --size]
+    #[arg(long, value_name = "SIZE", value_parser = font)]
+    pub font: Option<f64>,
+    /// What tells its curves apart; dashes and grey have markers too [default: colour]
+    #[arg(long, value_name = "WITH", value_parser = ["colour", "dashes", "grey"])]
+    pub lines: Option<String>,
+    /// Panels side by side [default: 1]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u8).range(1..=6))]
+    pub columns: Option<u8>,
+    /// Its title in place of name and solver; "" for none
+    #[arg(long, value_name = "TEXT")]
+    pub title: Option<String>,
+}
+
+/// Figures of a report as files.
+#[derive(clap::Args, Clone, Debug, Default)]
+pub struct Figures {
+    /// Write each figure of the page as a file beside it
+    #[arg(long, value_name = "KIND", value_parser = ["pdf", "svg", "png"])]
+    pub figures: Option<String>,
+    /// How they are drawn
+    #[command(flatten)]
+    pub look: Look,
+}
+
+impl Figures {
+    /// Name and bytes of each file, if any are requested.
+    pub fn files(&self, drawn: impl FnOnce() -> Vec<(String, Figure)>) -> Vec<(String, Vec<u8>)> {
+        let Some(ending) = &self.figures else { return Vec::new() };
+        let file = |(name, figure): (String, Figure)| {
+            let name = format!("{name}.{ending}");
+            let kind = plot::Kind::of(std::path::Path::new(&name)).unwrap_or(plot::Kind::Svg);
+            let bytes = plot::picture(&self.look.titled(figure), &self.look.look(), kind);
+            (name, bytes)
+        };
+        drawn().into_iter().map(file).collect()
+    }
+}
+
+impl Look {
+    /// As the renderers read it.
+    pub fn look(&self) -> plot::Look {
+        let usual = plot::Look::default();
+        let font = self.font.unwrap_or(if self.size.is_some() { 8.0 / 0.75 } else { usual.font });
+        let columns = self.columns.map_or(usual.columns, usize::from);
+        let lines = match self.lines.as_deref() {
+            Some("dashes") => Lines::Dashes,
+            Some("grey") => Lines::Grey,
+            Some(_) | None => usual.lines,
+        };
+        plot::Look { size: self.size, font, lines, columns }
+    }
+
+    /// A figure with the title that it is given; in print it has none by default.
+    pub fn titled(&self, figure: Figure) -> Figure {
+        match (&self.title, self.size) {
+            (Some(title), _) => Figure { title: title.clone(), subtitle: String::new(), ..figure },
+            (None, Some(_)) => Figure { title: String::new(), subtitle: String::new(), ..figure },
+            (None, None) => figure,
+        }
+    }
+}
+
 /// `fric run`
 #[derive(clap::Args, Debug)]
 pub struct Run {
@@ -218,18 +288,24 @@ pub struct Run {
     /// Changes to the experiment
     #[command(flatten)]
     pub changed: Changed,
-    /// Folder for a plot (SVG) and the data (CSV) of each experiment [default: out, unless --plot, --csv or --json]
+    /// Folder for a plot (SVG) and the data (CSV) of each experiment [default: out, unless --plot, --data or --json]
     #[arg(long, value_name = "DIR", value_hint = ValueHint::DirPath)]
     pub out: Option<PathBuf>,
-    /// Write the plot of one experiment to this file: .svg or .png
+    /// Write the plot of one experiment to this file: .svg, .png or .pdf
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath, value_parser = picture)]
     pub plot: Option<PathBuf>,
-    /// Write the data of one experiment to this file
-    #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
-    pub csv: Option<PathBuf>,
-    /// Interval between rows of the CSV, such as 1ms, instead of one row per step
+    /// How it is drawn
+    #[command(flatten)]
+    pub look: Look,
+    /// Write the data of one experiment, a row for each step: .csv, .parquet, .mat (MATLAB) or .npz (NumPy)
+    #[arg(long, alias = "csv", value_name = "FILE", value_hint = ValueHint::FilePath, value_parser = data)]
+    pub data: Option<PathBuf>,
+    /// Interval between rows of the data, such as 1ms, instead of one row per step
     #[arg(long, value_name = "TIME", value_parser = positive_time)]
     pub every: Option<f64>,
+    /// Only as many rows of the data as a plot needs: some thousands, with every minimum and maximum
+    #[arg(long, conflicts_with = "every")]
+    pub thin: bool,
     /// Print one JSON object per run, one a line, instead of text and plots
     #[arg(long)]
     pub json: bool,
@@ -302,9 +378,12 @@ pub struct Sweep {
     /// Threads [default: one for each core]
     #[arg(long, value_name = "N", value_parser = threads)]
     pub threads: Option<usize>,
-    /// Plot measures over a parameter: .svg or .png
+    /// Plot measures over a parameter: .svg, .png or .pdf
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath, value_parser = picture)]
     pub plot: Option<PathBuf>,
+    /// How it is drawn
+    #[command(flatten)]
+    pub look: Look,
     /// Measure to plot, as written: 'period(x)' [default: all]
     #[arg(long, value_name = "MEASURE", requires = "plot")]
     pub show: Option<String>,
@@ -578,9 +657,12 @@ pub struct Characterise {
     /// Change a parameter: `Fs=2N`
     #[arg(long = "set", value_name = "NAME=VALUE", value_parser = setting)]
     pub set: Vec<(String, String)>,
-    /// Folder for the report, the battery and the tables [default: out/MODEL]
+    /// Folder for the report, the battery and the tables, also as LaTeX [default: out/MODEL]
     #[arg(long, value_name = "DIR", value_hint = ValueHint::DirPath)]
     pub out: Option<PathBuf>,
+    /// Figures as files of their own
+    #[command(flatten)]
+    pub figures: Figures,
     /// Print one JSON object per model, one a line, instead of text
     #[arg(long)]
     pub json: bool,
@@ -592,9 +674,12 @@ pub struct Compare {
     /// Models of the library with arguments, or .fric files
     #[arg(required = true, value_name = "MODEL|FILE", value_hint = ValueHint::FilePath)]
     pub models: Vec<String>,
-    /// Folder for the page [default: out/compare]
+    /// Folder for the page and its tables as LaTeX [default: out/compare]
     #[arg(long, value_name = "DIR", value_hint = ValueHint::DirPath)]
     pub out: Option<PathBuf>,
+    /// Figures as files of their own
+    #[command(flatten)]
+    pub figures: Figures,
     /// Print one JSON object per model, one a line, instead of text
     #[arg(long)]
     pub json: bool,
@@ -966,11 +1051,60 @@ fn matrices(text: &str) -> Result<PathBuf, String> {
     }
 }
 
+/// A length in px, 96 to the inch, from a number and the unit of a length; `pt` is the point of PostScript.
+fn px(number: &str, unit: &str) -> Result<f64, String> {
+    let number: f64 = number.trim().parse().map_err(|_| format!("`{number}` is no number"))?;
+    let inches = match unit {
+        "mm" => 1.0 / 25.4,
+        "cm" => 1.0 / 2.54,
+        "in" => 1.0,
+        "pt" => 1.0 / 72.0,
+        "px" => 1.0 / 96.0,
+        _ => return Err("lengths are in mm, cm, in, pt or px".into()),
+    };
+    Ok(96.0 * number * inches)
+}
+
+/// `85x60mm`: width and height in px.
+fn size(text: &str) -> Result<(f64, f64), String> {
+    let text = text.replace('×', "x").replace(' ', "");
+    // `px` has an x of its own.
+    let split = text.split_at_checked(text.len().saturating_sub(2)).ok_or("write it as 85x60mm")?;
+    let (numbers, unit) = split;
+    let (width, height) = numbers.split_once('x').ok_or("write width and height, as in 85x60mm")?;
+    let width = width.trim_end_matches(unit);
+    let (width, height) = (px(width, unit)?, px(height, unit)?);
+    let (least, most) = (px("20", "mm")?, px("2000", "mm")?);
+    if [width, height].iter().all(|side| (least..=most).contains(side)) {
+        Ok((width, height))
+    } else {
+        Err("a figure is from 20 mm to 2 m wide and tall".into())
+    }
+}
+
+/// `8pt`: a size of letters in px.
+fn font(text: &str) -> Result<f64, String> {
+    let text = text.trim();
+    let (number, unit) = text.split_at_checked(text.len().saturating_sub(2)).ok_or("write it as 8pt")?;
+    let size = px(number, unit)?;
+    let (least, most) = (px("3", "pt")?, px("72", "pt")?);
+    if (least..=most).contains(&size) { Ok(size) } else { Err("letters are from 3pt to 72pt tall".into()) }
+}
+
 fn picture(text: &str) -> Result<PathBuf, String> {
     let path = PathBuf::from(text);
     match path.extension().and_then(|extension| extension.to_str()) {
-        Some("svg" | "png") => Ok(path),
-        _ => Err("the name of a plot ends in .svg or .png".into()),
+        Some("svg" | "png" | "pdf") => Ok(path),
+        _ => Err("the name of a plot ends in .svg, .png or .pdf".into()),
+    }
+}
+
+/// A name of a recording.
+fn data(text: &str) -> Result<PathBuf, String> {
+    let path = PathBuf::from(text);
+    match path.extension().and_then(|extension| extension.to_str()).map(str::to_ascii_lowercase).as_deref() {
+        Some("csv" | "parquet" | "mat" | "npz") => Ok(path),
+        _ => Err("the name of the data ends in .csv, .parquet, .mat (MATLAB) or .npz (NumPy)".into()),
     }
 }
 
@@ -1001,6 +1135,23 @@ mod tests {
     fn shards_are_counted_from_one() {
         assert_eq!(shard("2/8"), Ok((2, 8)));
         assert!(shard("0/8").is_err() && shard("9/8").is_err() && shard("3").is_err() && shard("1/0").is_err());
+    }
+
+    #[test]
+    fn sizes_of_figures_are_lengths() {
+        let close = |found: Result<(f64, f64), String>, width: f64, height: f64| {
+            let (w, h) = found.unwrap();
+            assert!((w - width).abs() < 1e-9 && (h - height).abs() < 1e-9, "{w} {h}");
+        };
+        close(size("85x60mm"), 85.0 * 96.0 / 25.4, 60.0 * 96.0 / 25.4);
+        close(size("85mm x 60mm"), 85.0 * 96.0 / 25.4, 60.0 * 96.0 / 25.4);
+        close(size("3.5×2in"), 336.0, 192.0);
+        close(size("800x600px"), 800.0, 600.0);
+        for wrong in ["85mm", "85x60", "0x60mm", "85x-60mm", "1e9x60mm", "NaNxNaNmm", "xmm", "", "é"] {
+            assert!(size(wrong).is_err(), "{wrong}");
+        }
+        assert!((font("9pt").unwrap() - 12.0).abs() < 1e-9);
+        assert!(font("900pt").is_err() && font("9").is_err() && font("").is_err());
     }
 
     #[test]

@@ -1,13 +1,15 @@
-//! Converts CSV tables to Parquet files, for pandas, Polars or DuckDB.
+//! Converts CSV tables and columns of numbers to Parquet files, for pandas, Polars or DuckDB, and reads columns back.
 //!
-//! In: rows of comma-separated values and the type of each column. Out: a file. An empty cell becomes a null. The only
-//! file that uses the crate `parquet`.
+//! In: rows of comma-separated values and the type of each column, or columns. Out: a file. An empty cell becomes a
+//! null. The only file that uses the crate `parquet`.
 
 use ::parquet::basic::{self, LogicalType, Repetition};
 use ::parquet::data_type::{BoolType, ByteArray, ByteArrayType, DataType, DoubleType, Int64Type};
 use ::parquet::errors::ParquetError;
 use ::parquet::file::properties::WriterProperties;
+use ::parquet::file::reader::{FileReader, SerializedFileReader};
 use ::parquet::file::writer::{SerializedFileWriter, SerializedRowGroupWriter};
+use ::parquet::record::Field;
 use ::parquet::schema::types::Type;
 use std::io::{self, Read, Write};
 use std::sync::Arc;
@@ -58,6 +60,85 @@ pub fn from_csv(csv: impl Read, header: bool, columns: &[(String, Holds)], to: i
             return Ok(());
         }
     }
+}
+
+/// Writes columns of one length: numbers, or 0 and 1 as booleans.
+///
+/// # Errors
+/// Those of the writer.
+pub fn of_columns(headings: &[(String, Holds)], columns: &[Vec<f64>], to: impl Write + Send) -> io::Result<()> {
+    let mut file = SerializedFileWriter::new(to, Arc::new(schema(headings)?), Arc::new(WriterProperties::default()))?;
+    let rows = columns.first().map_or(0, Vec::len);
+    for from in (0..rows).step_by(GROUP) {
+        let part = from..rows.min(from + GROUP);
+        let present = vec![1i16; part.len()];
+        let mut group = file.next_row_group()?;
+        for ((_, holds), numbers) in headings.iter().zip(columns) {
+            let numbers = &numbers[part.clone()];
+            let mut column = group.next_column()?.expect("one column of the schema is left");
+            if *holds == Holds::Booleans {
+                let values: Vec<bool> = numbers.iter().map(|number| *number > 0.5).collect();
+                column.typed::<BoolType>().write_batch(&values, Some(&present), None)?;
+            } else {
+                column.typed::<DoubleType>().write_batch(numbers, Some(&present), None)?;
+            }
+            column.close()?;
+        }
+        group.close()?;
+    }
+    file.close()?;
+    Ok(())
+}
+
+/// The columns of numbers and truth values of a file, with their headings; times of day and dates in s. An empty cell
+/// is NaN. Columns of other types are left out.
+///
+/// # Errors
+/// Why it cannot be read, in words.
+pub fn columns(bytes: Vec<u8>) -> Result<Vec<(String, Vec<f64>)>, String> {
+    let told = |error: ParquetError| match error {
+        ParquetError::General(what) if what.contains("Disabled feature") => {
+            let codec = what.rsplit(": ").next().unwrap_or_default();
+            format!("its columns are compressed by {codec}: write them with `compression='snappy'`, 'gzip' or none")
+        }
+        error => error.to_string(),
+    };
+    let file = SerializedFileReader::new(::bytes::Bytes::from(bytes)).map_err(told)?;
+    let names: Vec<String> =
+        file.metadata().file_metadata().schema().get_fields().iter().map(|field| field.name().to_string()).collect();
+    let mut columns: Vec<(String, Option<Vec<f64>>)> = names.into_iter().map(|name| (name, Some(Vec::new()))).collect();
+    for row in file.get_row_iter(None).map_err(told)? {
+        let row = row.map_err(told)?;
+        for ((_, column), (_, field)) in columns.iter_mut().zip(row.get_column_iter()) {
+            match (number(field), column.as_mut()) {
+                (Some(number), Some(numbers)) => numbers.push(number),
+                _ => *column = None,
+            }
+        }
+    }
+    Ok(columns.into_iter().filter_map(|(name, numbers)| Some((name, numbers?))).collect())
+}
+
+/// The number of a cell; none if it holds none.
+fn number(field: &Field) -> Option<f64> {
+    Some(match *field {
+        Field::Null => f64::NAN,
+        Field::Bool(holds) => f64::from(u8::from(holds)),
+        Field::Byte(x) => f64::from(x),
+        Field::Short(x) => f64::from(x),
+        Field::Int(x) => f64::from(x),
+        Field::Long(x) => x as f64,
+        Field::UByte(x) => f64::from(x),
+        Field::UShort(x) => f64::from(x),
+        Field::UInt(x) => f64::from(x),
+        Field::ULong(x) => x as f64,
+        Field::Float16(x) => f64::from(f32::from(x)),
+        Field::Float(x) => f64::from(x),
+        Field::Double(x) => x,
+        Field::TimestampMillis(x) => x as f64 / 1e3,
+        Field::TimestampMicros(x) => x as f64 / 1e6,
+        _ => return None,
+    })
 }
 
 /// The columns as a Parquet schema.
@@ -114,7 +195,6 @@ fn chunk<T: DataType, W: Write + Send>(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use ::parquet::file::reader::{FileReader, SerializedFileReader};
     use std::fs::File;
 
     fn columns() -> Vec<(String, Holds)> {

@@ -2,6 +2,7 @@
 //!
 //! In: paths and imports. Out: texts, or the reason in words why there is none. Knows nothing of the language.
 
+use runtime::record::blocks;
 use std::fs;
 use std::io::{self, Write};
 use std::os::unix::fs::{DirBuilderExt, OpenOptionsExt};
@@ -23,6 +24,10 @@ const MOST_BYTES: u64 = 64 << 20;
 /// # Errors
 /// Why not, in words.
 pub fn read(path: &Path) -> Result<String, String> {
+    text(read_bytes(path)?)
+}
+
+fn read_bytes(path: &Path) -> Result<Vec<u8>, String> {
     let about = |error: io::Error| match error.kind() {
         io::ErrorKind::NotFound => "there is no such file".to_string(),
         io::ErrorKind::PermissionDenied => "it may not be read (permission denied)".into(),
@@ -36,7 +41,7 @@ pub fn read(path: &Path) -> Result<String, String> {
     if metadata.len() > MOST_BYTES {
         return Err(format!("it is larger than {} MB", MOST_BYTES >> 20));
     }
-    text(fs::read(path).map_err(about)?)
+    fs::read(path).map_err(about)
 }
 
 /// Reads the text on the standard input.
@@ -89,14 +94,28 @@ impl crate::compile::Sources for Disk {
     }
 
     fn file(&self, from: &str, path: &str) -> Result<(String, String), String> {
-        let folder = Path::new(from).parent().unwrap_or(Path::new(""));
-        let path = tidy(&folder.join(path));
-        // A pipe named on the command line is intentional; one named in an import would block `check` for ever.
-        if fs::metadata(&path).is_ok_and(|found| !found.is_file() && !found.is_dir()) {
-            return Err("it is a pipe or a device, not a file".into());
+        let (path, bytes) = bytes_named(from, path)?;
+        if bytes.starts_with(blocks::MAGIC) {
+            let log = path.display();
+            return Err(format!("it is the log of a rig: `fric replay {log} --csv log.csv` makes a table of it"));
         }
-        read(&path).map(|text| (path.display().to_string(), text))
+        Ok((path.display().to_string(), text(bytes)?))
     }
+}
+
+/// The path of a file that the text `from` names, and its bytes.
+///
+/// # Errors
+/// Why it cannot be read, in words.
+pub fn bytes_named(from: &str, path: &str) -> Result<(PathBuf, Vec<u8>), String> {
+    let folder = Path::new(from).parent().unwrap_or(Path::new(""));
+    let path = tidy(&folder.join(path));
+    // A pipe named on the command line is intentional; one named in an import would block `check` for ever.
+    if fs::metadata(&path).is_ok_and(|found| !found.is_file() && !found.is_dir()) {
+        return Err("it is a pipe or a device, not a file".into());
+    }
+    let bytes = read_bytes(&path)?;
+    Ok((path, bytes))
 }
 
 /// The path without `.` and `folder/..`, so that one file has one name.

@@ -115,8 +115,9 @@ fn wrong_usage_and_wrong_input_have_different_exit_codes() {
     folder.check(&["run", "pull.fric", "--solver", "rk5"], 2, "the solvers are euler, rk4, expo, implicit, adaptive");
     folder.check(&["run", "pull.fric", "--set", "k"], 2, "PATH=VALUE");
     folder.check(&["run", "pull.fric", "--tol", "0"], 2, "between 0 and 1");
-    folder.check(&["run", "pull.fric", "holds", "--plot", "a.jpg"], 2, ".svg or .png");
-    folder.check(&["run", "pull.fric", "--plot", "a.svg"], 2, "one experiment");
+    folder.check(&["run", "pull.fric", "holds", "--plot", "a.jpg"], 2, ".svg, .png or .pdf");
+    folder.check(&["run", "pull.fric", "--data", "a.csv"], 2, "one experiment");
+    folder.check(&["run", "pull.fric", "holds", "--data", "a.xls"], 2, ".mat (MATLAB) or .npz (NumPy)");
     assert_eq!(folder.names("."), ["pull.fric"], "wrong usage writes nothing");
 }
 
@@ -486,7 +487,7 @@ fn an_experiment_can_be_changed_from_outside() {
 #[test]
 fn files_that_would_hold_nothing_are_refused() {
     let folder = Folder::new("nothing").with("pull.fric", PULL);
-    for (option, file) in [("--csv", "a.csv"), ("--plot", "a.svg")] {
+    for (option, file) in [("--data", "a.csv"), ("--plot", "a.svg")] {
         let (_, err) = folder.check(&["run", "pull.fric", "breaks", option, file], 1, "");
         assert!(err.contains(&format!("{option} has nothing to write: `breaks` records nothing; add `plot`")), "{err}");
     }
@@ -634,6 +635,105 @@ experiment it {
         let found = shown(k);
         assert!((found.0 - value).abs() < 1e-9 && found.1 == unit, "{k}: {found:?}, not {value} {unit}");
     }
+}
+
+#[test]
+fn data_is_every_step_in_the_format_of_its_name() {
+    let folder = Folder::new("data").with("pull.fric", PULL);
+    // 20,001 rows, of which a plot needs a part.
+    let run = |more: &[&str]| folder.run(&[&["run", "pull.fric", "holds", "--step", "100us"], more].concat());
+    let rows = |name: &str| fs::read_to_string(folder.0.join(name)).unwrap().lines().count();
+    assert_eq!(run(&["--data", "a.csv"]).status.code(), Some(0));
+    assert_eq!(rows("a.csv"), 20_002);
+    let done = run(&["--data", "thin.csv", "--thin"]);
+    let words = String::from_utf8_lossy(&done.stdout);
+    assert!((1000..15_000).contains(&rows("thin.csv")) && words.contains(" of 20,001 steps)"), "{words}");
+    let magic: [(&str, &[u8]); 3] = [("a.parquet", b"PAR1"), ("a.mat", b"MATLAB 5.0"), ("a.npz", b"PK")];
+    for (name, begin) in magic {
+        assert_eq!(run(&["--data", name]).status.code(), Some(0));
+        assert!(fs::read(folder.0.join(name)).unwrap().starts_with(begin), "{name}");
+    }
+    let done = run(&["--data", "a.xls"]);
+    assert_eq!(done.status.code(), Some(2));
+    assert!(String::from_utf8_lossy(&done.stderr).contains("ends in .csv, .parquet, .mat (MATLAB) or .npz (NumPy)"));
+    assert_eq!(run(&["--thin", "--json"]).status.code(), Some(2));
+    assert_eq!(run(&["--thin", "--every", "1ms"]).status.code(), Some(2));
+    // What was written is a recording for another experiment, whatever the format.
+    let again = |name: &str| {
+        let text = format!(
+            "model Same {{ input v [m/s]  output y [m/s] = v }}\nexperiment same {{\n  run Same(v = data.v)\n  \
+             data \"{name}\" (v [m/s] = \"v\", t = \"t\")\n  show final(y)\n}}\n"
+        );
+        fs::write(folder.0.join("same.fric"), text).unwrap();
+        let done = folder.run(&["run", "same.fric", "--json"]);
+        assert_eq!(done.status.code(), Some(0), "{name}: {done:?}");
+        String::from_utf8_lossy(&done.stdout).split("\"value\":").nth(1).unwrap().split(',').next().unwrap().to_string()
+    };
+    let csv = again("a.csv");
+    for name in ["a.parquet", "a.mat", "a.npz"] {
+        assert_eq!(again(name), csv, "{name}");
+    }
+}
+
+#[test]
+fn several_experiments_make_one_figure() {
+    let folder = Folder::new("together").with("pull.fric", PULL);
+    folder.check(
+        &["run", "pull.fric", "holds", "silent", "--plot", "both.svg", "--size", "170x60mm", "--columns", "2"],
+        0,
+        "wrote both.svg",
+    );
+    let text = fs::read_to_string(folder.0.join("both.svg")).unwrap();
+    assert!(
+        text.contains("width=\"170.00mm\" height=\"60.00mm\"") && text.contains(">holds<") && text.contains(">silent<")
+    );
+    folder.check(
+        &["run", "pull.fric", "silent", "--plot", "a.pdf", "--font", "9pt", "--lines", "grey", "--title", ""],
+        0,
+        "a.pdf",
+    );
+    assert!(fs::read(folder.0.join("a.pdf")).unwrap().starts_with(b"%PDF"));
+    for wrong in [["--size", "85x60"], ["--size", "1x1mm"], ["--font", "8"], ["--lines", "red"], ["--columns", "0"]] {
+        let done = folder.run(&[&["run", "pull.fric", "silent", "--plot", "b.pdf"], &wrong[..]].concat());
+        assert_eq!(done.status.code(), Some(2), "{wrong:?}");
+    }
+    assert!(!folder.0.join("b.pdf").exists());
+}
+
+/// A figure for a paper is made from one text, and by every format of it.
+#[test]
+fn the_figure_of_the_example_is_made_from_its_text() {
+    let example = Path::new(env!("CARGO_MANIFEST_DIR")).join("examples/paper-figure");
+    let read = |name: &str| fs::read(example.join(name)).unwrap();
+    let folder =
+        Folder::new("paper").with("p.fric", read("paper_figure.fric")).with("measured.csv", read("measured.csv"));
+    let run = |more: &[&str]| {
+        let both = ["run", "p.fric", "hysteresis", "break_away", "--no-error", "--size", "174x75mm", "--columns", "2"];
+        let done = folder.run(&[&both, more].concat());
+        assert_eq!(done.status.code(), Some(0), "{done:?}");
+    };
+    run(&["--plot", "a.svg"]);
+    let svg = fs::read_to_string(folder.0.join("a.svg")).unwrap();
+    let words = [
+        "(a) hysteresis in presliding",
+        "(b) break-away",
+        "measured",
+        "friction force [N]",
+        "displacement [µm]",
+        "break-away force [N]",
+        "force rate [N/s]",
+    ];
+    for word in words {
+        assert!(svg.contains(&format!(">{word}<")), "{word}: {svg}");
+    }
+    // The recording is drawn once, although three models run; nothing is called by its expression.
+    assert_eq!(svg.matches(">measured<").count(), 1);
+    assert!(!svg.contains("fr.F") && !svg.contains("data.F"));
+    run(&["--plot", "a.pdf"]);
+    let pdf = fs::read(folder.0.join("a.pdf")).unwrap();
+    let text = String::from_utf8_lossy(&pdf);
+    // 174 mm are 493.23 points.
+    assert!(text.contains("/MediaBox [0 0 493.2") && text.contains("/FontFile2"), "{}", &text[..600]);
 }
 
 #[test]

@@ -26,6 +26,7 @@ const CRATES: [(&str, &str, &[&str]); 6] = [
 /// Where an outside crate may be named: files or folders. A crate used throughout one of ours has the source folder of
 /// that crate as its home.
 const HOMES: &[(&str, &[&str])] = &[
+    ("bytes", &["src/parquet.rs"]),
     ("can-dbc", &["compiler/src/rig/dbc.rs"]),
     // An option's values are the cases of an enum: one of them lies where they are carried out.
     ("clap", &["src/args.rs", "src/compile.rs", "rig/src/main.rs"]),
@@ -47,13 +48,14 @@ const HOMES: &[(&str, &[&str])] = &[
     ("miette", &["src/report.rs"]),
     ("minisign", &["src/signing.rs"]),
     ("minisign-verify", &["runtime/src/package/signature.rs"]),
-    ("miniz_oxide", &["runtime/src/record/packed.rs"]),
+    ("miniz_oxide", &["src/matrices.rs", "runtime/src/record/packed.rs"]),
     ("nalgebra", &["runtime/src/coupling/"]),
     ("parquet", &["src/parquet.rs"]),
+    ("pdf-writer", &["src/plot/pdf.rs"]),
     ("pest", &["grammar/src/parse.rs"]),
     ("pest_derive", &["grammar/src/parse.rs"]),
     ("rayon", &["runtime/src/engine/sweep.rs"]),
-    ("resvg", &["src/plot/png.rs"]),
+    ("resvg", &["src/plot/png.rs", "src/plot/pdf.rs"]),
     ("rtrb", &["runtime/src/spsc.rs"]),
     ("rustix", &["runtime/src/record/parts.rs"]),
     ("rustyline", &["src/repl/line.rs"]),
@@ -63,6 +65,7 @@ const HOMES: &[(&str, &[&str])] = &[
     ("socketcan", &["runtime/src/can/socketcan.rs"]),
     ("stacker", &["grammar/src/parse.rs"]),
     ("strsim", &["compiler/src/frontend/names.rs"]),
+    ("subsetter", &["src/plot/pdf.rs"]),
     ("tempfile", &["src/commands/deploy.rs"]),
     ("terminal_size", &["src/terminal.rs"]),
 ];

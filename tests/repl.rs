@@ -379,7 +379,7 @@ fn mistakes_are_named_with_their_remedy() {
     says("ans", "there is no `ans` yet");
     says("save try.txt", "`save try.fric`");
     says("save try.fric", "there is nothing to save yet");
-    says("f = LuGre()\nplot f.F against f.v = 0 m/s .. 1 m/s to x.gif", "ends in .svg or .png");
+    says("f = LuGre()\nplot f.F against f.v = 0 m/s .. 1 m/s to x.gif", "ends in .svg, .png or .pdf");
     says("why E9999", "there is no page about `E9999`");
     says("why chater", "did you mean chatter?");
     says("watch", "watch what?");

@@ -18,6 +18,8 @@ mod study;
 
 pub mod page;
 
+pub mod latex;
+
 pub use measured::shown;
 pub use phenomena::Seen;
 pub use study::{Extent, Study, drawn, study};

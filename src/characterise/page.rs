@@ -171,13 +171,16 @@ fn page(title: &str, body: &str) -> String {
     )
 }
 
-/// One test: its figures, and its numbers if the page is for one model only.
-fn section(test: &Test, studies: &[&Study]) -> String {
-    let found: Vec<(&Study, &Test)> = studies
+/// Graphs of one kind: of each model its number, its label and the graph.
+type Group<'a> = Vec<(usize, &'a str, &'a Graph)>;
+
+/// The graphs of one test that share a figure, and in words why others are missing.
+fn groups<'a>(test: &Test, studies: &[&'a Study]) -> (Vec<Group<'a>>, String) {
+    let found: Vec<(&'a Study, &'a Test)> = studies
         .iter()
         .filter_map(|study| Some((*study, study.tests.iter().find(|other| other.key == test.key)?)))
         .collect();
-    let mut graphs: Vec<Vec<(usize, &str, &Graph)>> = Vec::new();
+    let mut graphs: Vec<Group> = Vec::new();
     let mut reasons = String::new();
     for (study, test) in &found {
         let number = studies.iter().position(|other| std::ptr::eq(*other, *study)).unwrap_or_default();
@@ -206,16 +209,56 @@ fn section(test: &Test, studies: &[&Study]) -> String {
             }
         }
     }
+    (graphs, reasons)
+}
+
+/// Every figure of the studies, each with a name for its file.
+pub fn figures(studies: &[&Study]) -> Vec<(String, plot::Figure)> {
+    let tests = studies.first().map_or(&[][..], |study| &study.tests);
+    let mut out: Vec<(String, plot::Figure)> = Vec::new();
+    for test in tests {
+        for group in groups(test, studies).0 {
+            let key = group[0].2.key.to_string();
+            // Graphs of one kind in two units have one name.
+            let again = out.iter().filter(|(name, _)| *name == key || name.starts_with(&format!("{key}-"))).count();
+            let name = if again == 0 { key } else { format!("{key}-{}", again + 1) };
+            out.push((name, figure(&group, studies.len())));
+        }
+    }
+    out
+}
+
+/// What was done in a test, in a sentence; for several models that differ in it, one for each.
+fn caption(found: &[(&Study, &Test)]) -> String {
+    match found {
+        [] => String::new(),
+        [(_, first), others @ ..] if others.iter().all(|(_, test)| test.how == first.how) => escaped(&first.how),
+        all => {
+            let one = |(study, test): &(&Study, &Test)| format!("{}: {}", escaped(&study.label), escaped(&test.how));
+            all.iter().map(one).collect::<Vec<_>>().join("<br>")
+        }
+    }
+}
+
+/// One test: its figures, and its numbers if the page is for one model only.
+fn section(test: &Test, studies: &[&Study]) -> String {
+    let found: Vec<(&Study, &Test)> = studies
+        .iter()
+        .filter_map(|study| Some((*study, study.tests.iter().find(|other| other.key == test.key)?)))
+        .collect();
+    let (graphs, reasons) = groups(test, studies);
     let wide = graphs.len() > 1;
     let mut out = format!("<section{}>\n<header><h3>{}</h3>\n", if wide { " class=\"wide\"" } else { "" }, test.title);
-    if let [(_, test)] = found[..] {
-        let _ = writeln!(out, "<p class=\"how\">{}</p>", escaped(&test.how));
-    }
+    let _ = writeln!(out, "<p class=\"how\">{}</p>", caption(&found));
     out += "</header>\n";
     for group in &graphs {
         let id = format!("{}-", group[0].2.key);
         let drawn = figure(group, studies.len());
-        let _ = writeln!(out, "<figure style=\"margin:0\">{}</figure>", plot::inline(&drawn, WIDE, &id));
+        let _ = writeln!(
+            out,
+            "<figure style=\"margin:0\">{}</figure>",
+            plot::inline(&drawn, &plot::Look::default(), WIDE, &id)
+        );
     }
     out += &reasons;
     if let [(_, test)] = found[..]
@@ -251,7 +294,7 @@ fn parameters(study: &Study) -> String {
     out + "</table>\n"
 }
 
-fn scale_rows(study: &Study) -> [(&'static str, String); 4] {
+pub(super) fn scale_rows(study: &Study) -> [(&'static str, String); 4] {
     let scales = &study.scales;
     [
         ("break-away force of a slow ramp, F_b", shown(scales.f_b, study.units.force)),

@@ -79,12 +79,14 @@ pub fn figure(graphs: &[(usize, &str, &Graph)], among: usize) -> Figure {
         points: line.points.iter().map(|(x, y)| (x / x_scale, drawn(*y) / y_scale)).collect(),
         boolean: false,
         marks: line.marks,
+        recorded: false,
         style: (among > 1).then_some(style),
     });
     let axis = |(name, _): &(String, String), unit: Unit, logarithmic| Axis {
         name: name.clone(),
         unit: unit.text,
         logarithmic,
+        range: None,
     };
     let panel = Panel {
         x: axis(&first.x, x_unit, first.logarithmic.0),
@@ -92,6 +94,7 @@ pub fn figure(graphs: &[(usize, &str, &Graph)], among: usize) -> Figure {
         curves: curves.collect(),
         // Shades of several models would overlap.
         bands: if alone { first.bands.clone() } else { Vec::new() },
+        ..Panel::default()
     };
     Figure { title: String::new(), subtitle: String::new(), panels: vec![panel] }
 }

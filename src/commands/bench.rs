@@ -3,7 +3,6 @@
 use super::{End, compiled, has_experiment, load, reported};
 use crate::args::Bench;
 use crate::compile::{self, Method, Options, Stages, Stopwatch};
-use crate::project;
 use crate::quantity::{count, duration, significant};
 use crate::terminal::Terminal;
 use abi::lanes::{Batch, Lanes};
@@ -36,7 +35,7 @@ pub fn bench(args: &Bench, terminal: &mut Terminal) -> End {
         terminal.error("an adaptive run has no fixed step to time; choose one with --solver, such as --solver expo");
         return End::Misused;
     }
-    let built = match compile::build(&mut loaded, &project::Disk, &args.experiment, &changes, &mut Vec::new()) {
+    let built = match compile::build(&mut loaded, &crate::disk::Disk, &args.experiment, &changes, &mut Vec::new()) {
         Ok(built) => built,
         Err(diagnostics) => {
             reported(&loaded, &diagnostics, terminal);

@@ -3,8 +3,8 @@
 use super::{End, chosen_rig, load, reported};
 use crate::args::BenchRt as Args;
 use crate::compile::{self, Stopwatch};
+use crate::quantity;
 use crate::terminal::{Style, Terminal};
-use crate::{project, quantity};
 use runtime::drive::polarity_check::SignTest;
 use runtime::hil::cycle::{Hil, Options, look_ahead};
 use runtime::hil::simulated::{Pace, World};
@@ -50,7 +50,7 @@ fn of_rig(file: &Path, args: &Args, terminal: &mut Terminal) -> End {
         Ok(name) => name,
         Err(why) => return refused(terminal, &why),
     };
-    let ready = compile::rig(&mut loaded, &project::Disk, &name, &compile::Options::default(), &mut Vec::new());
+    let ready = compile::rig(&mut loaded, &crate::disk::Disk, &name, &compile::Options::default(), &mut Vec::new());
     let mut ready = match ready {
         Ok(ready) => ready,
         Err(found) => {

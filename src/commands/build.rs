@@ -64,7 +64,7 @@ pub fn build(args: &Build, terminal: &mut Terminal) -> End {
     }
     let changes = args.stepped.changes();
     let mut found = Vec::new();
-    let built = match compile::build(&mut loaded, &project::Disk, &name, &changes, &mut found) {
+    let built = match compile::build(&mut loaded, &crate::disk::Disk, &name, &changes, &mut found) {
         Ok(built) => built,
         Err(diagnostics) => {
             reported(&loaded, &diagnostics, terminal);

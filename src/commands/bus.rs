@@ -3,8 +3,8 @@
 use super::{End, load, reported};
 use crate::args::Bus as Args;
 use crate::compile::{self, Stopwatch};
+use crate::quantity;
 use crate::terminal::Terminal;
-use crate::{project, quantity};
 use abi::rig::{Kind, Message};
 use runtime::can::address::Address;
 use runtime::can::bridge::Hub;
@@ -170,7 +170,7 @@ impl Known {
         }
         for rig in rigs {
             let options = compile::Options::default();
-            let ready = compile::rig(&mut loaded, &project::Disk, &rig, &options, &mut Vec::new());
+            let ready = compile::rig(&mut loaded, &crate::disk::Disk, &rig, &options, &mut Vec::new());
             let ready = ready.map_err(|found| {
                 reported(&loaded, &found, terminal);
                 End::Failed

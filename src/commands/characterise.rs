@@ -1,9 +1,9 @@
 //! `fric characterise` and `fric compare`: run friction models through the standard battery.
 
 use super::End;
-use crate::args::{Characterise, Compare};
+use crate::args::{Characterise, Compare, Figures};
 use crate::characterise::subject::{self, Origin, Subject, Written};
-use crate::characterise::{Extent, Seen, Study, page, shown, study};
+use crate::characterise::{Extent, Seen, Study, latex, page, shown, study};
 use crate::compile::{self, Changes, Loaded, Options};
 use crate::terminal::{Style, Terminal};
 use crate::{project, report};
@@ -18,14 +18,14 @@ pub fn characterise(args: &Characterise, terminal: &mut Terminal) -> End {
     let mut end = End::Fine;
     for (subject, folder) in found {
         let label = subject.instance.label();
-        let study = match study(subject, &battery_in(&folder), &project::Disk, Extent::Whole) {
+        let study = match study(subject, &battery_in(&folder), &crate::disk::Disk, Extent::Whole) {
             Ok(study) => study,
             Err(why) => {
                 end = failed(terminal, &format!("{label} {why}"));
                 continue;
             }
         };
-        let written = write(&study, &folder);
+        let written = write(&study, &folder, &args.figures);
         if args.json {
             terminal.line(&json(&study).to_string());
         } else {
@@ -34,7 +34,7 @@ pub fn characterise(args: &Characterise, terminal: &mut Terminal) -> End {
         match written {
             Ok(count) if !args.json => {
                 let page = folder.join("report.html");
-                terminal.line(&format!("  wrote {}, battery.fric and {count} tables beside it\n", page.display()));
+                terminal.line(&format!("  wrote {}, battery.fric, report.tex and {count} beside it\n", page.display()));
             }
             Ok(_) => {}
             Err(why) => end = failed(terminal, &why),
@@ -54,7 +54,7 @@ pub fn compare(args: &Compare, terminal: &mut Terminal) -> End {
         };
         for (subject, _) in found {
             let label = subject.instance.label();
-            match study(subject, &battery_in(&folder), &project::Disk, Extent::Whole) {
+            match study(subject, &battery_in(&folder), &crate::disk::Disk, Extent::Whole) {
                 Ok(study) => studies.push(study),
                 Err(why) => end = failed(terminal, &format!("{label} {why}")),
             }
@@ -64,8 +64,19 @@ pub fn compare(args: &Compare, terminal: &mut Terminal) -> End {
         return End::Failed;
     }
     let path = folder.join("compare.html");
-    if let Err(error) = project::write(&path, page::comparison(&studies).as_bytes()) {
-        return failed(terminal, &format!("cannot write {}: {error}", path.display()));
+    let all: Vec<&Study> = studies.iter().collect();
+    let mut files = vec![
+        ("compare.html".to_string(), page::comparison(&studies).into_bytes()),
+        ("compare.tex".to_string(), latex::tables(&studies).into_bytes()),
+    ];
+    let figures = args.figures.files(|| page::figures(&all));
+    let count = if figures.is_empty() { String::new() } else { format!(" and {} figures", figures.len()) };
+    files.extend(figures);
+    for (name, bytes) in files {
+        let path = folder.join(name);
+        if let Err(error) = project::write(&path, &bytes) {
+            return failed(terminal, &format!("cannot write {}: {error}", path.display()));
+        }
     }
     if args.json {
         for study in &studies {
@@ -74,7 +85,7 @@ pub fn compare(args: &Compare, terminal: &mut Terminal) -> End {
         return end;
     }
     terminal.print(&table(&studies, terminal));
-    terminal.line(&format!("  wrote {}\n", path.display()));
+    terminal.line(&format!("  wrote {}, compare.tex{count} beside it\n", path.display()));
     end
 }
 
@@ -112,7 +123,7 @@ fn subjects(
         written = vec![Written::read(what)?];
     } else if written.is_empty() {
         let text = project::read(path).map_err(|why| format!("cannot read {what}: {why}"))?;
-        let loaded = compile::load(what, &text, &project::Disk);
+        let loaded = compile::load(what, &text, &crate::disk::Disk);
         if loaded.has_errors() {
             return Err(report::full(&loaded.files.0, &loaded.diagnostics, false));
         }
@@ -149,12 +160,12 @@ pub(super) fn fitted(written: Written, file: Option<&Path>, folder: &Path) -> Re
     let imports = match file {
         None => imports[1].clone(),
         Some(_) => {
-            let alone = compile::load(&name, &probe(&imports[0], &written, &[]), &project::Disk);
+            let alone = compile::load(&name, &probe(&imports[0], &written, &[]), &crate::disk::Disk);
             let unknown = compiled(&alone, "probe").is_err_and(|found| found.contains("E0201"));
             imports[usize::from(unknown)].clone()
         }
     };
-    let loaded = compile::load(&name, &imports, &project::Disk);
+    let loaded = compile::load(&name, &imports, &crate::disk::Disk);
     if loaded.has_errors() {
         return Err(report::full(&loaded.files.0, &loaded.diagnostics, false));
     }
@@ -173,7 +184,7 @@ pub(super) fn fitted(written: Written, file: Option<&Path>, folder: &Path) -> Re
     let open: Vec<&str> =
         subject::open_inputs(model).into_iter().filter(|name| matches!(*name, "v" | "F_ext")).collect();
     let zero: Vec<(&str, &str)> = open.iter().map(|name| (*name, "0")).collect();
-    let loaded = compile::load(&name, &probe(&imports, &written, &zero), &project::Disk);
+    let loaded = compile::load(&name, &probe(&imports, &written, &zero), &crate::disk::Disk);
     let cases = compiled(&loaded, "probe")?;
     let instance = &cases[0].instance;
     let description = instance.description();
@@ -215,7 +226,7 @@ fn compiled(loaded: &Loaded, name: &str) -> Result<Vec<compile::Case>, String> {
         return Err(report::full(&loaded.files.0, &loaded.diagnostics, false));
     }
     let options = Options { changes: Changes::default(), interpret: true };
-    compile::compile(&mut loaded, &project::Disk, name, &options, &mut Vec::new(), &mut |_| ())
+    compile::compile(&mut loaded, &crate::disk::Disk, name, &options, &mut Vec::new(), &mut |_| ())
         .map_err(|found| report::full(&loaded.files.0, &found, false))
 }
 
@@ -230,10 +241,14 @@ fn relative(file: &Path, folder: &Path) -> String {
     up.chain(down).collect::<Vec<_>>().join("/")
 }
 
-/// Writes the report, the battery, and a table for each graph; returns the number of tables.
-fn write(study: &Study, folder: &Path) -> Result<usize, String> {
-    let mut files: Vec<(String, String)> =
-        vec![("report.html".into(), page::report(study)), ("battery.fric".into(), study.battery.clone())];
+/// Writes the report, the battery, a table for each graph and the requested figures; returns how many of the last two.
+fn write(study: &Study, folder: &Path, figures: &Figures) -> Result<String, String> {
+    let mut files: Vec<(String, Vec<u8>)> = vec![
+        ("report.html".into(), page::report(study).into_bytes()),
+        ("battery.fric".into(), study.battery.clone().into_bytes()),
+        ("report.tex".into(), latex::tables(std::slice::from_ref(study)).into_bytes()),
+    ];
+    let others = files.len();
     for graph in study.tests.iter().filter_map(|test| test.result.as_ref().ok()).flatten() {
         let unit = |unit: &str| if unit.is_empty() { String::new() } else { format!(" [{unit}]") };
         let mut table = format!("curve,{}{},{}{}\n", graph.x.0, unit(&graph.x.1), graph.y.0, unit(&graph.y.1));
@@ -242,14 +257,20 @@ fn write(study: &Study, folder: &Path) -> Result<usize, String> {
                 table += &format!("\"{}\",{x},{y}\n", line.name.replace('"', "'"));
             }
         }
-        files.push((format!("{}.csv", graph.key), table));
+        files.push((format!("{}.csv", graph.key), table.into_bytes()));
     }
-    let tables = files.len() - 2;
-    for (name, text) in files {
+    let tables = files.len() - others;
+    let figures = figures.files(|| page::figures(&[study]));
+    let count = match figures.len() {
+        0 => format!("{tables} tables"),
+        figures => format!("{tables} tables and {figures} figures"),
+    };
+    files.extend(figures);
+    for (name, bytes) in files {
         let path = folder.join(name);
-        project::write(&path, text.as_bytes()).map_err(|error| format!("cannot write {}: {error}", path.display()))?;
+        project::write(&path, &bytes).map_err(|error| format!("cannot write {}: {error}", path.display()))?;
     }
-    Ok(tables)
+    Ok(count)
 }
 
 /// Prints the summary of one model.

@@ -58,9 +58,9 @@ fn found_in(path: &Path, timings: &mut Timings, terminal: &Terminal) -> Option<(
     match project::read(path) {
         Ok(text) => {
             watch.stage("parse");
-            let mut loaded = compile::load(&name, &text, &project::Disk);
+            let mut loaded = compile::load(&name, &text, &crate::disk::Disk);
             watch.stage("check");
-            let found = compile::check(&mut loaded, &project::Disk);
+            let found = compile::check(&mut loaded, &crate::disk::Disk);
             timings.add_all(&watch.stop());
             Some((loaded, found))
         }

@@ -51,7 +51,7 @@ fn plots(folder: &Path, terminal: &mut Terminal) -> Result<(), String> {
             let battery = folder.join("battery.fric").display().to_string();
             let studied = Written::read(name)
                 .and_then(|written| fitted(written, None, folder))
-                .and_then(|subject| study(subject, &battery, &project::Disk, Extent::Sketch));
+                .and_then(|subject| study(subject, &battery, &crate::disk::Disk, Extent::Sketch));
             let studied = match studied {
                 Ok(studied) => studied,
                 Err(why) => {
@@ -63,7 +63,7 @@ fn plots(folder: &Path, terminal: &mut Terminal) -> Result<(), String> {
             for (key, _) in SHOWN {
                 let Some(figure) = drawn(&studied, key) else { continue };
                 let path = folder.join(format!("{name}-{key}.svg"));
-                let svg = plot::inline(&figure, 560.0, "axes");
+                let svg = plot::inline(&figure, &plot::Look::default(), 560.0, "axes");
                 project::write(&path, svg.as_bytes())
                     .map_err(|error| format!("cannot write {}: {error}", path.display()))?;
             }
@@ -75,7 +75,7 @@ fn plots(folder: &Path, terminal: &mut Terminal) -> Result<(), String> {
 /// Every file of the library by its dotted name, with its items.
 fn library() -> Vec<(String, Vec<Item>)> {
     let items = |(module, text): &(&'static str, &'static str)| {
-        let loaded = compile::load(module, text, &project::Disk);
+        let loaded = compile::load(module, text, &crate::disk::Disk);
         (module.to_string(), loaded.files.get(loaded.root()).ast.items().cloned().collect())
     };
     project::library().iter().map(items).collect()

@@ -3,7 +3,6 @@
 use super::{End, load, reported};
 use crate::args::{Doctor as Args, LookedAt};
 use crate::compile::{self, Options, Stopwatch};
-use crate::project;
 use crate::terminal::{Style, Terminal};
 use runtime::can::address::Address;
 use runtime::can::sim::Simulation;
@@ -69,7 +68,7 @@ fn of_rigs(path: &Path, terminal: &Terminal) -> Result<Vec<(Address, Option<u32>
     }
     let mut buses = Vec::new();
     for rig in rigs {
-        let ready = compile::rig(&mut loaded, &project::Disk, &rig, &Options::default(), &mut Vec::new());
+        let ready = compile::rig(&mut loaded, &crate::disk::Disk, &rig, &Options::default(), &mut Vec::new());
         let ready = ready.map_err(|diagnostics| {
             reported(&loaded, &diagnostics, terminal);
             End::Failed

@@ -3,7 +3,6 @@
 use super::{End, chosen_rig, load, reported};
 use crate::args::Drives as Args;
 use crate::compile::{self, Options, Stopwatch};
-use crate::project;
 use crate::terminal::Terminal;
 use runtime::drive::serve::{Doors, Refused, Served, Sheet};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -21,7 +20,7 @@ pub fn drives(args: &Args, terminal: &mut Terminal) -> End {
         }
     };
     let options = Options { changes: args.set.changes(), ..Options::default() };
-    let ready = match compile::rig(&mut loaded, &project::Disk, &name, &options, &mut Vec::new()) {
+    let ready = match compile::rig(&mut loaded, &crate::disk::Disk, &name, &options, &mut Vec::new()) {
         Ok(ready) => ready,
         Err(diagnostics) => {
             reported(&loaded, &diagnostics, terminal);

@@ -4,8 +4,8 @@ use super::End;
 use crate::args::Explain;
 use crate::compile::{self, Explanation, Method, Stopwatch, Verdict};
 use crate::quantity::duration;
+use crate::report;
 use crate::terminal::{Style, Terminal};
-use crate::{project, report};
 use serde_json::json;
 use std::path::Path;
 use std::time::Instant;
@@ -78,8 +78,8 @@ fn models(args: &Explain, terminal: &mut Terminal) -> End {
             continue;
         }
         let explained = match imported {
-            true => compile::explain_in(&loaded, &project::Disk, name, loaded.root()),
-            false => compile::explain(&loaded, &project::Disk, name),
+            true => compile::explain_in(&loaded, &crate::disk::Disk, name, loaded.root()),
+            false => compile::explain(&loaded, &crate::disk::Disk, name),
         };
         match explained {
             Ok(explanation) => {
@@ -242,7 +242,7 @@ pub(super) struct Bound {
 fn bounds(loaded: &compile::Loaded, explanation: &Explanation) -> Vec<Bound> {
     let timed = explanation.steps.iter().filter(|step| step.code.is_some());
     let bound = |method: Method| {
-        let mut instance = compile::stepping(loaded, &project::Disk, &explanation.model, method, STEP).ok()?;
+        let mut instance = compile::stepping(loaded, &crate::disk::Disk, &explanation.model, method, STEP).ok()?;
         let mut calls: Vec<f64> = (0..CALLS)
             .map(|_| {
                 let begin = Instant::now();

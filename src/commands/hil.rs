@@ -6,7 +6,7 @@ use crate::args::Hil as Args;
 use crate::compile::{self, Options, Ready, Stopwatch};
 use crate::source_snapshot::Keeping;
 use crate::terminal::{Style, Terminal};
-use crate::{loop_stability, project, quantity, report};
+use crate::{loop_stability, quantity, report};
 use abi::rig::Rig;
 use runtime::can::Bus;
 use runtime::can::sim::Simulation;
@@ -32,7 +32,7 @@ use std::time::Duration;
 const BLACK_BOX_NS: u64 = 10_000_000_000;
 
 pub fn hil(args: &Args, terminal: &mut Terminal) -> End {
-    let keeping = Keeping::new(&project::Disk);
+    let keeping = Keeping::new(&crate::disk::Disk);
     let mut watch = Stopwatch::start("read");
     let Some(mut loaded) = load_from(&args.file, &keeping, terminal, &mut watch) else { return End::Failed };
     let name = match chosen_rig(&args.file, args.rig.as_deref(), &loaded) {

@@ -22,7 +22,7 @@ pub fn linearise(args: &Linearise, terminal: &mut Terminal) -> End {
     let ports = Ports { inputs: args.inputs.clone(), outputs: args.outputs.clone(), params: args.params.clone() };
     let changes = Changes { ports: Some(ports), ..args.set.changes() };
     let options = Options { changes, ..Options::default() };
-    let mut linear = match compile::linear(&mut loaded, &project::Disk, &args.name, &options, &mut Vec::new()) {
+    let mut linear = match compile::linear(&mut loaded, &crate::disk::Disk, &args.name, &options, &mut Vec::new()) {
         Ok(linear) => linear,
         Err(diagnostics) => {
             reported(&loaded, &diagnostics, terminal);

@@ -29,6 +29,7 @@ mod test;
 
 use crate::args::{self, Args, Command, Key, Repl};
 use crate::compile::{self, Case, Loaded, Options, Sources, Stages, Stopwatch};
+use crate::figure::Kept;
 use crate::terminal::Terminal;
 use crate::timings::Timings;
 use crate::{project, report};
@@ -124,7 +125,7 @@ fn has_experiment(file: &Path, name: &str, all: &[String]) -> Result<(), String>
 
 /// Reads and loads a text; reports problems in it. None if it cannot be used.
 fn load(path: &Path, terminal: &Terminal, watch: &mut Stopwatch) -> Option<Loaded> {
-    load_from(path, &project::Disk, terminal, watch)
+    load_from(path, &crate::disk::Disk, terminal, watch)
 }
 
 /// The same with imports from other sources.
@@ -181,7 +182,7 @@ fn chosen_rig(file: &Path, name: Option<&str>, loaded: &Loaded) -> Result<String
 /// Refuses and reports errors of `fric check` in the models of a text; prints the number of warnings in one line.
 fn sound(loaded: &Loaded, quiet: bool, terminal: &Terminal, watch: &mut Stopwatch) -> Result<(), Vec<Diagnostic>> {
     watch.stage("models");
-    let found = compile::check_models(loaded, &project::Disk);
+    let found = compile::check_models(loaded, &crate::disk::Disk);
     if found.iter().any(Diagnostic::is_error) {
         reported(loaded, &found, terminal);
         return Err(found);
@@ -219,7 +220,7 @@ fn compiled(
     let mut watch = Stopwatch::start("names");
     let mut found = Vec::new();
     let cases =
-        compile::compile(loaded, &project::Disk, experiment, options, &mut found, &mut |stage| watch.stage(stage));
+        compile::compile(loaded, &crate::disk::Disk, experiment, options, &mut found, &mut |stage| watch.stage(stage));
     if !warn {
         found.clear();
     }
@@ -243,14 +244,14 @@ fn done(cases: Vec<Case>, stages: Stages, quiet: bool, errors: bool) -> Done {
     done_beside(cases, stages, quiet, errors, |_, _| ()).0
 }
 
-/// As [`done`], and calls `beside` with the cases and their recordings, in a thread of its own while the errors are
+/// As [`done`], and calls `beside` with the cases, their recordings and verdicts, in a thread of its own while the errors are
 /// estimated.
 fn done_beside<T: Send>(
     cases: Vec<Case>,
     stages: Stages,
     quiet: bool,
     errors: bool,
-    beside: impl FnOnce(&[Case], &[Recording]) -> T + Send,
+    beside: impl FnOnce(&[Case], &[Kept]) -> T + Send,
 ) -> (Done, T) {
     let bar = progress::bar(1000, "{percent:>3} %  {elapsed} of about {duration}", quiet);
     let begin = Instant::now();
@@ -272,10 +273,12 @@ fn done_beside<T: Send>(
     let mut results = runs::run(&all, &watch);
     let wall = begin.elapsed().as_secs_f64();
     // The estimate needs no recording.
-    let recordings: Vec<Recording> = results.iter_mut().map(|result| std::mem::take(recording(result))).collect();
+    let verdicts = |result: &Result<Outcome, Failure>| result.as_ref().map_or(Vec::new(), |done| done.verdicts.clone());
+    let kept: Vec<Kept> =
+        results.iter_mut().map(|result| (std::mem::take(recording(result)), verdicts(result))).collect();
     let (told, judging) = std::thread::scope(|scope| {
         let begin = Instant::now();
-        let beside = || beside(&cases, &recordings);
+        let beside = || beside(&cases, &kept);
         if !errors {
             return (beside(), 0.0);
         }
@@ -285,7 +288,7 @@ fn done_beside<T: Send>(
         let judging = begin.elapsed().as_secs_f64();
         (beside.join().unwrap_or_else(|why| std::panic::resume_unwind(why)), judging)
     });
-    results.iter_mut().zip(recordings).for_each(|(result, own)| *recording(result) = own);
+    results.iter_mut().zip(kept).for_each(|(result, (own, _))| *recording(result) = own);
     bar.clear();
     (Done { cases, results, wall, judging, stages }, told)
 }

@@ -8,8 +8,8 @@ use crate::args::Predict as Args;
 use crate::compile::{self, Changes, Loaded, Options, Ready, Stopwatch};
 use crate::loop_stability::{Contact, contacts};
 use crate::quantity::significant;
+use crate::report;
 use crate::terminal::Terminal;
-use crate::{project, report};
 use abi::Slot;
 use abi::description::{Kind as QuantityKind, Quantity};
 use abi::rig::Kind;
@@ -34,7 +34,7 @@ pub fn predict(args: &Args, terminal: &mut Terminal) -> End {
     let set = args.set.texts();
     let options = Options { changes: args.set.changes(), interpret: false };
     let mut found = Vec::new();
-    let ready = compile::rig(&mut loaded, &project::Disk, &name, &options, &mut found);
+    let ready = compile::rig(&mut loaded, &crate::disk::Disk, &name, &options, &mut found);
     found.extend(ready.as_ref().err().into_iter().flatten().cloned());
     if !found.is_empty() && (!args.json || ready.is_err()) {
         terminal.report(&report::full(&loaded.files.0, &found, terminal.error_colour()));
@@ -373,7 +373,7 @@ fn twins(
     }
     let mut case = |set: Vec<String>| {
         let options = Options { changes: Changes { set, ..Changes::default() }, interpret: false };
-        compile::compile(loaded, &project::Disk, experiment, &options, &mut Vec::new(), &mut |_| ())
+        compile::compile(loaded, &crate::disk::Disk, experiment, &options, &mut Vec::new(), &mut |_| ())
     };
     let (late, ideal) = (case(set.to_vec())?.swap_remove(0), case(at_once)?.swap_remove(0));
     let mut series: Vec<(String, Slot, abi::unit::Unit)> = Vec::new();

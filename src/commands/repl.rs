@@ -299,8 +299,8 @@ impl Prompt<'_> {
         match file {
             Some(file) => {
                 let path = PathBuf::from(file);
-                let png = path.extension().is_some_and(|extension| extension == "png");
-                let bytes = if png { plot::png(&drawn) } else { plot::svg(&drawn).into_bytes() };
+                let kind = plot::Kind::of(&path).ok_or("the name of a plot ends in .svg, .png or .pdf")?;
+                let bytes = plot::picture(&drawn, &plot::Look::default(), kind);
                 project::write(&path, &bytes).map_err(|error| format!("cannot write {file}: {error}"))?;
                 self.terminal.line(&format!("wrote {file}"));
             }
@@ -502,8 +502,22 @@ impl Prompt<'_> {
         }
         let name = what.trim_start_matches("rotary ").split('(').next().unwrap_or_default().trim().to_string();
         let args = match self.session.origin(&name) {
-            Some(file) => Characterise { what: file, models: vec![what], set: Vec::new(), out: None, json: false },
-            None => Characterise { what, models: Vec::new(), set: Vec::new(), out: None, json: false },
+            Some(file) => Characterise {
+                what: file,
+                models: vec![what],
+                set: Vec::new(),
+                out: None,
+                json: false,
+                figures: Default::default(),
+            },
+            None => Characterise {
+                what,
+                models: Vec::new(),
+                set: Vec::new(),
+                out: None,
+                json: false,
+                figures: Default::default(),
+            },
         };
         match super::characterise::characterise(&args, self.terminal) {
             End::Fine => Ok(()),

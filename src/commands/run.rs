@@ -1,20 +1,21 @@
 //! `fric run`: compiles experiments, runs them, and shows and writes their results.
 
 use super::{Done, End, compiled, done_beside, has_experiment, load, sound};
-use crate::args::Run;
+use crate::args::{self, Run};
 use crate::commands::shared::cross_check::{Crossed, cross};
 use crate::compile::{Case, Loaded, Options, Stages, Stopwatch};
-use crate::figure::{self, Recorded};
-use crate::plot::{self, Figure};
+use crate::figure::{self, Kept, Recorded};
+use crate::plot::{self, Figure, Kind};
+use crate::recording_files::{self, Format};
 use crate::results::{self, Ran};
 use crate::terminal::{Style, Terminal};
 use crate::timings::Timings;
-use crate::{project, report};
+use crate::{project, quantity, report};
 use grammar::diagnostic::Diagnostic;
-use runtime::engine::Continue;
-use runtime::engine::even_grid;
-use runtime::record::{Recording, csv};
+use runtime::engine::{self, Continue, even_grid};
+use runtime::record::Recording;
 use serde_json::json;
+use std::borrow::Cow;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
@@ -28,16 +29,23 @@ pub fn run(args: &Run, timings: &mut Timings, terminal: &mut Terminal) -> End {
             return End::Failed;
         }
     };
-    if names.len() > 1 && (args.plot.is_some() || args.csv.is_some()) {
+    if names.len() > 1 && args.data.is_some() {
         terminal.error(&format!(
-            "--plot and --csv are for one experiment, and this runs {}: name one, or use --out DIR",
+            "--data is for one experiment, and this runs {}: name one, or use --out DIR",
             names.join(", ")
         ));
         return End::Misused;
     }
     let by_default = args.plot.is_none() && !args.json;
-    if args.every.is_some() && args.csv.is_none() && args.out.is_none() && !by_default {
-        terminal.error("--every is for the rows of a CSV file, and none is written: add --csv FILE or --out DIR");
+    let rows = [(args.every.is_some(), "--every"), (args.thin, "--thin")];
+    if let Some((_, option)) = rows.into_iter().find(|(given, _)| *given)
+        && args.data.is_none()
+        && args.out.is_none()
+        && !by_default
+    {
+        terminal.error(&format!(
+            "{option} is for the rows of the data, and none are written: add --data FILE or --out DIR"
+        ));
         return End::Misused;
     }
     if let Err(diagnostics) = sound(&loaded, args.json || args.quiet, terminal, &mut watch) {
@@ -50,9 +58,26 @@ pub fn run(args: &Run, timings: &mut Timings, terminal: &mut Terminal) -> End {
     timings.add_all(&stages);
     let options = Options { changes: args.changed.changes(), interpret: args.interpret };
     let mut end = End::Fine;
+    // Of several experiments --plot makes one figure.
+    let mut together = (names.len() > 1 && args.plot.is_some()).then(Figure::default);
     for name in &names {
-        if experiment(args, &mut loaded, name, &options, &stages, timings, terminal) != End::Fine {
+        if experiment(args, &mut loaded, name, &options, &stages, &mut together, timings, terminal) != End::Fine {
             end = End::Failed;
+        }
+    }
+    if let (Some(figure), Some(path)) = (together, &args.plot) {
+        if figure.panels.is_empty() {
+            terminal.error(&format!("--plot has nothing to write: none of {} has a `plot`", names.join(", ")));
+            return End::Failed;
+        }
+        let picture = plot::picture(&args.look.titled(figure), &args.look.look(), Kind::of(path).unwrap_or(Kind::Svg));
+        match project::write(path, &picture) {
+            Ok(()) if !args.quiet && !args.json => terminal.line(&format!("wrote {}", path.display())),
+            Ok(()) => {}
+            Err(error) => {
+                terminal.error(&format!("cannot write {}: {error}", path.display()));
+                return End::Failed;
+            }
         }
     }
     end
@@ -74,12 +99,14 @@ fn chosen(args: &Run, loaded: &Loaded) -> Result<Vec<String>, String> {
     Ok(if args.experiments.is_empty() { all } else { args.experiments.clone() })
 }
 
+#[allow(clippy::too_many_arguments)]
 fn experiment(
     args: &Run,
     loaded: &mut Loaded,
     name: &str,
     options: &Options,
     before: &Stages,
+    together: &mut Option<Figure>,
     timings: &mut Timings,
     terminal: &mut Terminal,
 ) -> End {
@@ -104,7 +131,11 @@ fn experiment(
     }
 
     if cases.iter().all(|case| case.experiment.plots.is_empty()) {
-        let asked = [(args.plot.is_some(), "--plot"), (args.csv.is_some(), "--csv"), (args.every.is_some(), "--every")];
+        let asked = [
+            (args.plot.is_some() && together.is_none(), "--plot"),
+            (args.data.is_some(), "--data"),
+            (args.every.is_some(), "--every"),
+        ];
         if let Some((_, option)) = asked.into_iter().find(|(asked, _)| *asked) {
             terminal.error(&format!(
                 "{}: {option} has nothing to write: `{name}` records nothing; add `plot` with what to record, such as `plot x, v`",
@@ -131,13 +162,22 @@ fn experiment(
     stages.0.iter().skip(before.0.len()).for_each(|(stage, seconds)| timings.add(stage, *seconds));
     // Files are written before anything is said: they exist even if the reader of our output has gone.
     let errors = !args.trust.no_error;
-    let files = |cases: &[Case], recordings: &[Recording]| {
+    let picture = args.plot.as_ref().filter(|_| together.is_none());
+    let files = |cases: &[Case], kept: &[Kept]| {
         let begin = Instant::now();
-        let drawn = drawn(name, cases, recordings);
-        let written = write(args, name, cases, recordings, &grids, drawn.as_ref());
+        let recorded = figure::recorded(cases, kept);
+        let drawn = drawn(name, cases, &recorded, &args.look);
+        let written = write(args, name, cases, &recorded, &grids, drawn.as_ref(), picture);
         (drawn, written, begin.elapsed().as_secs_f64())
     };
     let (done, (drawn, written, of_files)) = done_beside(cases, stages, !talking, errors, files);
+    if let (Some(all), Some(figure)) = (together.as_mut(), &drawn) {
+        let mut panels = figure.panels.clone();
+        if let Some(first) = panels.first_mut().filter(|first| first.title.is_empty()) {
+            first.title = name.into();
+        }
+        all.panels.append(&mut panels);
+    }
     timings.add("run", done.wall);
     match errors {
         true => {
@@ -188,10 +228,9 @@ fn experiment(
         }
     }
     match written {
-        Ok(paths) => {
-            if talking && !paths.is_empty() {
-                let paths: Vec<String> = paths.iter().map(|path| path.display().to_string()).collect();
-                terminal.line(&format!("  wrote {}\n", paths.join(", ")));
+        Ok(written) => {
+            if talking && !written.is_empty() {
+                terminal.line(&format!("  wrote {}\n", written.join(", ")));
             }
             if passed { End::Fine } else { End::Failed }
         }
@@ -210,58 +249,101 @@ fn place(loaded: &Loaded, name: &str) -> String {
 }
 
 /// All recordings in one figure; none if the experiment plots nothing.
-fn drawn(name: &str, cases: &[Case], recordings: &[Recording]) -> Option<Figure> {
+fn drawn(name: &str, cases: &[Case], recorded: &[Recorded], look: &args::Look) -> Option<Figure> {
     let first = cases.first()?;
     if first.experiment.plots.is_empty() {
         return None;
     }
-    let cases = recorded(cases, recordings);
     let subtitle = format!("{}, {}", first.instance.description().name, results::solver(&first.experiment.solver));
-    Some(figure::figure(name, &subtitle, &first.experiment.plots, &cases))
+    Some(look.titled(figure::figure(name, &subtitle, 0, recorded)))
 }
 
-/// The recordings with the labels of their cases.
-fn recorded<'a>(cases: &'a [Case], recordings: &'a [Recording]) -> Vec<Recorded<'a>> {
-    cases.iter().map(|case| case.label.as_str()).zip(recordings).collect()
-}
+/// Most rows of the data that the default folder gets without being asked.
+const UNASKED_ROWS: u64 = 100_000;
 
-/// Writes the requested files; returns their paths, or the one that failed and why. `grids`: the instants of each case
-/// in s, if rows are requested on a time grid.
+/// Writes the requested files; returns their paths and remarks, or the one that failed and why. `grids`: the instants of
+/// each case in s, if rows are requested on a time grid.
 fn write(
     args: &Run,
     name: &str,
     cases: &[Case],
-    recordings: &[Recording],
+    recorded: &[Recorded],
     grids: &[Vec<f64>],
     drawn: Option<&Figure>,
-) -> Result<Vec<PathBuf>, (PathBuf, std::io::Error)> {
-    let by_default = args.plot.is_none() && args.csv.is_none() && !args.json;
+    picture: Option<&PathBuf>,
+) -> Result<Vec<String>, (PathBuf, String)> {
+    let by_default = args.plot.is_none() && args.data.is_none() && !args.json;
     let folder = args.out.clone().or(by_default.then(|| PathBuf::from("out")));
-    let mut files: Vec<(PathBuf, Vec<u8>)> = Vec::new();
-    if let Some(figure) = drawn {
-        for path in folder.iter().map(|folder| folder.join(format!("{name}.svg"))).chain(args.plot.clone()) {
-            let png = path.extension().is_some_and(|extension| extension == "png");
-            files.push((path, if png { plot::png(figure) } else { plot::svg(figure).into_bytes() }));
+    let mut written = Vec::new();
+    let Some(figure) = drawn else { return Ok(written) };
+    let put = |path: &Path, bytes: &[u8]| {
+        project::write(path, bytes).map_err(|error| (path.to_path_buf(), error.to_string()))?;
+        Ok(path.display().to_string())
+    };
+    for path in folder.iter().map(|folder| folder.join(format!("{name}.svg"))).chain(picture.cloned()) {
+        let bytes = plot::picture(figure, &args.look.look(), Kind::of(&path).unwrap_or(Kind::Svg));
+        written.push(put(&path, &bytes)?);
+    }
+    let tables: Vec<PathBuf> =
+        folder.iter().map(|folder| folder.join(format!("{name}.csv"))).chain(args.data.clone()).collect();
+    let asked = args.data.is_some() || args.out.is_some();
+    for (k, (case, &Recorded { label, recording, .. })) in cases.iter().zip(recorded).enumerate() {
+        // Measures over a parameter leave no recording.
+        if tables.is_empty() || recording.columns().is_empty() {
+            continue;
         }
-        for (k, (label, recording)) in recorded(cases, recordings).into_iter().enumerate() {
-            let mut bytes = Vec::new();
-            let evenly = grids.get(k).map(|grid| {
-                let case = &cases[k];
-                // How the run ends has been reported for the first one.
-                even_grid::record(case.instance.clone(), &case.experiment, grid, &mut |_| Continue::Continue(())).0
-            });
-            csv::write(evenly.as_ref().unwrap_or(recording), &mut bytes).expect("writing to memory does not fail");
-            for path in folder.iter().map(|folder| folder.join(format!("{name}.csv"))).chain(args.csv.clone()) {
-                files.push((for_case(&path, label), bytes.clone()));
-            }
+        let rows = rows(args, case, recording, grids.get(k), asked);
+        let (rows, remark) = rows.map_err(|why| (tables[0].clone(), why))?;
+        for path in &tables {
+            let path = for_case(path, label);
+            let format = Format::of(&path).unwrap_or(Format::Csv);
+            let bytes = recording_files::bytes(&rows, format).map_err(|error| (path.clone(), error.to_string()))?;
+            written.push(put(&path, &bytes)? + &remark);
         }
     }
-    let mut paths = Vec::new();
-    for (path, bytes) in files {
-        project::write(&path, &bytes).map_err(|error| (path.clone(), error))?;
-        paths.push(path);
+    Ok(written)
+}
+
+/// The rows of the data of a case: every step, unless something else is requested; and a remark if some are left out.
+fn rows<'a>(
+    args: &Run,
+    case: &Case,
+    recording: &'a Recording,
+    grid: Option<&Vec<f64>>,
+    asked: bool,
+) -> Result<(Cow<'a, Recording>, String), String> {
+    // How the run ends has been reported for the first one.
+    let mut watch = |_| Continue::Continue(());
+    if let Some(grid) = grid {
+        let evenly = even_grid::record(case.instance.clone(), &case.experiment, grid, &mut watch).0;
+        return Ok((Cow::Owned(evenly), String::new()));
     }
-    Ok(paths)
+    let (kept, seen) = (recording.rows().len() as u64, recording.seen());
+    if kept >= seen {
+        return Ok((Cow::Borrowed(recording), String::new()));
+    }
+    let of = format!("{} of {} steps", quantity::count(kept), quantity::count(seen));
+    if args.thin {
+        return Ok((Cow::Borrowed(recording), format!(" ({of})")));
+    }
+    if !asked && seen > UNASKED_ROWS {
+        return Ok((
+            Cow::Borrowed(recording),
+            format!(" ({of}: `--data FILE` writes all, `--every TIME` an even grid)"),
+        ));
+    }
+    match engine::every_step(case.instance.clone(), &case.experiment, &mut watch).0 {
+        Some(every) => Ok((Cow::Owned(every), String::new())),
+        None => {
+            let width = recording.columns().len() + 1;
+            let most = engine::MOST_NUMBERS / width;
+            Err(format!(
+                "{} steps of {width} columns are too many, {} steps are possible: take `--every 1ms`, or `--thin` for as many rows as a plot needs",
+                quantity::count(seen),
+                quantity::count(most as u64)
+            ))
+        }
+    }
 }
 
 /// The path with the label of a case before its extension: `compare-fr-LuGre.csv`.

@@ -78,7 +78,7 @@ fn compiled(args: &Sweep, loaded: &mut Loaded, terminal: &Terminal) -> Option<Ve
         interpret: args.interpret,
     };
     let name = &args.experiment;
-    let first = compile::varying(loaded, &project::Disk, name, &options, &mut Vec::new());
+    let first = compile::varying(loaded, &crate::disk::Disk, name, &options, &mut Vec::new());
     let open = |vary: &&Vary| match &first {
         Ok(cases) => cases.iter().any(|case| case.param(&vary.path).is_none()),
         Err(_) => true,
@@ -94,7 +94,7 @@ fn compiled(args: &Sweep, loaded: &mut Loaded, terminal: &Terminal) -> Option<Ve
         format!("{}={} {unit}", vary.path, vary.unit.from_si(vary.typical()))
     };
     options.changes.set.extend(missing.into_iter().map(shown));
-    match compile::varying(loaded, &project::Disk, name, &options, &mut Vec::new()) {
+    match compile::varying(loaded, &crate::disk::Disk, name, &options, &mut Vec::new()) {
         Ok(cases) => Some(cases),
         Err(diagnostics) => {
             reported(loaded, &diagnostics, terminal);
@@ -429,9 +429,9 @@ impl Table {
         }
         unfinished.finish();
         if let Some(path) = &args.plot {
-            let figure = self.figure(args, &summary)?;
-            let png = path.extension().is_some_and(|extension| extension == "png");
-            let bytes = if png { plot::png(&figure) } else { plot::svg(&figure).into_bytes() };
+            let figure = args.look.titled(self.figure(args, &summary)?);
+            let kind = plot::Kind::of(path).unwrap_or(plot::Kind::Svg);
+            let bytes = plot::picture(&figure, &args.look.look(), kind);
             project::write(path, &bytes).map_err(|error| format!("cannot write {}: {error}", path.display()))?;
         }
         if !args.quiet {
@@ -615,13 +615,13 @@ fn columns(cases: &[Varying], vary: &[Vary]) -> Vec<Column> {
         columns.push(plain("case", ColumnKind::Case));
     }
     for vary in vary {
-        let axis = Axis { name: vary.path.clone(), unit: vary.unit.text.clone(), logarithmic: false };
+        let axis = Axis { name: vary.path.clone(), unit: vary.unit.text.clone(), ..Axis::default() };
         columns.push(Column { title: axis.title(), axis, kind: ColumnKind::Varied });
     }
     let first = &cases[0];
     for (k, expect) in first.experiment.expects[..first.expects()].iter().enumerate() {
         for (j, Measure { text, unit, .. }) in expect.measures.iter().enumerate() {
-            let axis = Axis { name: text.clone(), unit: unit.text.clone(), logarithmic: false };
+            let axis = Axis { name: text.clone(), unit: unit.text.clone(), ..Axis::default() };
             columns.push(Column { title: axis.title(), axis, kind: ColumnKind::Measure(k, j) });
         }
         if !matches!(expect.condition, Formula::Shown(..)) {

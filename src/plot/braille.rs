@@ -1,6 +1,6 @@
 //! Renders a figure as text: Braille characters with eight dots per cell, axes with numbers, names beside the curves.
 
-use super::scale::{Scale, padded};
+use super::scale::Scale;
 use super::{Figure, Panel, decimate};
 
 /// Rows of a single panel, and of one among several.
@@ -27,7 +27,7 @@ fn draw(panel: &Panel, width: usize, rows: usize, colour: bool) -> String {
     let y_axis = if boolean {
         Scale::new(0.0, 1.0, 1)
     } else {
-        let (low, high) = padded(ys, 0.03);
+        let (low, high) = panel.y.ends(ys, 0.03);
         panel.y.scale(low, high, rows.div_ceil(3))
     };
     let names = panel.curves.len() > 1;
@@ -40,12 +40,16 @@ fn draw(panel: &Panel, width: usize, rows: usize, colour: bool) -> String {
     let left = y_axis.ticks.iter().map(|tick| tick.label.chars().count()).chain(band_names).max().unwrap_or(0);
     let left = left.clamp(4, NAME) + 2;
     let columns = width.saturating_sub(left + 2 + right).clamp(20, 160);
+    let xs = panel.x.ends(xs, 0.0);
     let x_axis = panel.x.scale(xs.0, xs.1, columns / 10);
 
     let mut canvas = Canvas::new(columns, rows);
     let (dots_x, dots_y) = ((columns * 2) as f64, (rows * 4) as f64);
-    let mut ends: Vec<Option<usize>> = Vec::new();
-    for (i, curve) in panel.curves.iter().enumerate() {
+    let mut ends: Vec<Option<usize>> = vec![None; panel.curves.len()];
+    // A cell has the colour of the first curve in it: recordings come last.
+    let (models, recorded): (Vec<usize>, Vec<usize>) =
+        (0..panel.curves.len()).partition(|i| !panel.curves[*i].recorded);
+    for (i, curve) in models.into_iter().chain(recorded).map(|i| (i, &panel.curves[i])) {
         let place = |&(x, y): &(f64, f64)| {
             if !(x.is_finite() && y.is_finite()) {
                 return (f64::NAN, f64::NAN);
@@ -57,13 +61,21 @@ fn draw(panel: &Panel, width: usize, rows: usize, colour: bool) -> String {
         let points: Vec<(f64, f64)> = curve.corners().iter().map(place).collect();
         let lines = decimate::lines(&points, dots_x, dots_y);
         for line in &lines {
-            canvas.line(line, i);
+            if curve.recorded {
+                line.iter().for_each(|point| canvas.line(&[*point], i));
+            } else {
+                canvas.line(line, i);
+            }
         }
-        ends.push(lines.last().and_then(|line| line.last()).map(|(_, y)| (y / 4.0) as usize));
+        ends[i] = lines.last().and_then(|line| line.last()).map(|(_, y)| (y.max(0.0) / 4.0) as usize);
     }
     let beside = if names { placed(&ends, rows) } else { vec![None; rows] };
 
-    let mut out = format!("{:left$}{}{}\n", "", panel.y.title(), noted(&y_axis.note));
+    let mut out = String::new();
+    if !panel.title.is_empty() {
+        out += &format!("{:left$}{}\n", "", panel.title);
+    }
+    out += &format!("{:left$}{}{}\n", "", panel.y.title(), noted(&y_axis.note));
     let row_of = |value: f64| ((1.0 - y_axis.position(value)) * (dots_y - 1.0) / 4.0) as usize;
     for (row, beside) in beside.iter().enumerate() {
         let tick = y_axis.ticks.iter().find(|tick| row_of(tick.at) == row);

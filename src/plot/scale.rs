@@ -76,11 +76,16 @@ impl Scale {
         let (first, last) = (from.floor() as i32, to.ceil() as i32);
         let every = ((last - first).max(1) as usize).div_ceil(count.max(1)) as i32;
         let few = to - from < 2.0;
+        // All labels of an axis are decimals, or all are powers of ten.
+        let labelled = |exponent: &i32| f64::from(*exponent) >= from - 1e-9 && f64::from(*exponent) <= to + 1e-9;
+        let decimals = (first..=last).filter(labelled).all(|exponent| (-2..4).contains(&exponent));
         let mut ticks = Vec::new();
         for exponent in first..=last {
             if exponent % every == 0 {
                 let label = match exponent {
-                    -2..4 => format!("{}", ten_to(exponent)),
+                    exponent if decimals => format!("{}", ten_to(exponent)),
+                    0 => "1".into(),
+                    1 => "10".into(),
                     exponent => format!("10{}", raised(exponent)),
                 };
                 ticks.push(Tick { at: f64::from(exponent), label });
@@ -88,7 +93,11 @@ impl Scale {
             for (digit, part) in BETWEEN.iter().filter(|_| few) {
                 let label = match exponent {
                     0 => (*digit).into(),
-                    -2..4 => format!("{}", digit.parse::<f64>().expect("a digit") * ten_to(exponent)),
+                    -3..4 if decimals => {
+                        // Rounded, because a product such as 5 · 0.001 is not the nearest double.
+                        let places = (-exponent).max(0) as usize;
+                        format!("{:.places$}", digit.parse::<f64>().expect("a digit") * ten_to(exponent))
+                    }
                     exponent => format!("{digit}·10{}", raised(exponent)),
                 };
                 ticks.push(Tick { at: f64::from(exponent) + part, label });
@@ -184,7 +193,8 @@ mod tests {
         let labels = |from: f64, to: f64, count: usize| {
             Scale::decades(from, to, count).ticks.into_iter().map(|tick| tick.label).collect::<Vec<_>>()
         };
-        assert_eq!(labels(-6.0, 0.0, 8), ["10⁻⁶", "10⁻⁵", "10⁻⁴", "10⁻³", "0.01", "0.1", "1"]);
+        assert_eq!(labels(-6.0, 0.0, 8), ["10⁻⁶", "10⁻⁵", "10⁻⁴", "10⁻³", "10⁻²", "10⁻¹", "1"]);
+        assert_eq!(labels(-2.0, 1.0, 8), ["0.01", "0.1", "1", "10"]);
         assert_eq!(labels(-0.05, 1.05, 8), ["1", "2", "5", "10"]);
         assert_eq!(labels(-1.5, -0.5, 4), ["0.05", "0.1", "0.2"]);
     }

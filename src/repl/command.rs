@@ -189,9 +189,9 @@ pub fn cut_to(rest: &str) -> Result<(&str, Option<&str>), String> {
     let Some(word) = words.last() else { return Ok((rest, None)) };
     let file = rest[word.end..].trim().trim_matches('"');
     match file.rsplit_once('.') {
-        _ if file.is_empty() => Err("to which file? `to x.svg` or `to x.png`".into()),
-        Some((_, "svg" | "png")) => Ok((rest[..word.start].trim_end(), Some(file))),
-        _ => Err(format!("the name of a picture ends in .svg or .png, not `{file}`")),
+        _ if file.is_empty() => Err("to which file? `to x.svg`, `to x.png` or `to x.pdf`".into()),
+        Some((_, "svg" | "png" | "pdf")) => Ok((rest[..word.start].trim_end(), Some(file))),
+        _ => Err(format!("the name of a picture ends in .svg, .png or .pdf, not `{file}`")),
     }
 }
 
@@ -239,6 +239,7 @@ mod tests {
     fn files_are_split_off() {
         assert_eq!(cut_to("x, v to a.svg"), Ok(("x, v", Some("a.svg"))));
         assert_eq!(cut_to("x to \"out/a.png\""), Ok(("x", Some("out/a.png"))));
+        assert_eq!(cut_to("x to a.pdf"), Ok(("x", Some("a.pdf"))));
         assert_eq!(cut_to("x"), Ok(("x", None)));
         assert!(cut_to("x to a.gif").is_err() && cut_to("x to ").is_err());
     }

@@ -5,7 +5,6 @@
 
 use crate::commands::reported;
 use crate::compile::{self, Case, Changes, Loaded, Options};
-use crate::project;
 use crate::quantity::{duration, show, significant};
 use crate::results;
 use crate::terminal::{Style, Terminal};
@@ -149,7 +148,7 @@ pub fn cross(
             partner
         }
     };
-    let partners = match compile::compile(loaded, &project::Disk, name, &partner, &mut Vec::new(), &mut |_| ()) {
+    let partners = match compile::compile(loaded, &crate::disk::Disk, name, &partner, &mut Vec::new(), &mut |_| ()) {
         Ok(partners) => partners,
         Err(diagnostics) => {
             reported(loaded, &diagnostics, terminal);
@@ -161,7 +160,7 @@ pub fn cross(
         false => {
             let mut sharp = options.clone();
             sharp.changes.tol = Some((0.01 * own.tol).max(1e-11));
-            compile::compile(loaded, &project::Disk, name, &sharp, &mut Vec::new(), &mut |_| ()).ok()
+            compile::compile(loaded, &crate::disk::Disk, name, &sharp, &mut Vec::new(), &mut |_| ()).ok()
         }
         true => None,
     };
@@ -179,7 +178,7 @@ pub fn cross(
             };
             let mut tried = |step: f64| {
                 let options = changed(fixed.experiment.solver.method, Some(step));
-                let cases = compile::compile(loaded, &project::Disk, name, &options, &mut Vec::new(), &mut |_| ());
+                let cases = compile::compile(loaded, &crate::disk::Disk, name, &options, &mut Vec::new(), &mut |_| ());
                 let crossed = compared(cases.ok()?.get(k)?, reference);
                 crossed.partner.is_ok().then(|| worst(&crossed.rows))
             };

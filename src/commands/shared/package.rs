@@ -84,7 +84,7 @@ pub(in crate::commands) fn packed(
 ) -> Result<(Vec<u8>, Option<String>), String> {
     let Wanted { name, target, features, set, key } = *wanted;
     let reported = || "the rig was not built".to_string();
-    let keeping = Keeping::new(&project::Disk);
+    let keeping = Keeping::new(&crate::disk::Disk);
     let mut loaded = load_from(file, &keeping, terminal, &mut Stopwatch::start("read")).ok_or_else(reported)?;
     let name = chosen_rig(file, name, &loaded)?;
     let mut found = Vec::new();

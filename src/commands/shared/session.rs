@@ -90,14 +90,13 @@ pub(in crate::commands) fn show_run(ran: &Ran, draw: bool, terminal: &mut Termin
 /// The plots of a run in one figure; `last`: only the plot that was added last.
 pub(in crate::commands) fn run_figure(ran: &Ran, last: bool) -> Option<Figure> {
     let first = ran.cases.first()?;
-    let plots = &first.experiment.plots;
-    let plots = if last { &plots[plots.len().saturating_sub(1)..] } else { &plots[..] };
-    if plots.is_empty() {
+    let count = first.experiment.plots.len();
+    if count == 0 {
         return None;
     }
-    let cases = figure::recorded(&ran.cases, &ran.results);
+    let cases = figure::of_results(&ran.cases, &ran.results);
     let subtitle = results::solver(&first.experiment.solver);
-    Some(figure::figure(&ran.name, &subtitle, plots, &cases))
+    Some(figure::figure(&ran.name, &subtitle, if last { count - 1 } else { 0 }, &cases))
 }
 
 /// The time of an instance, from which a run continues.

@@ -60,7 +60,7 @@ impl Table {
                 x: self.columns[x].axis.clone(),
                 y: self.columns[y].axis.clone(),
                 curves: vec![Curve { points, marks: true, ..Curve::default() }],
-                bands: Vec::new(),
+                ..Panel::default()
             }
         };
         Ok(Figure {

@@ -5,7 +5,6 @@
 use super::words::{Value, literal, model_of};
 use super::{Fault, Session, Setup, TEXT, Used, What, begin, found};
 use crate::compile::{self, Case, Changes, Explanation, Loaded, Lookup, QuantityInfo, SourceFile, Space};
-use crate::project;
 use abi::unit::{Dimension, Unit};
 use grammar::ast::{self, Item};
 use grammar::diagnostic::Diagnostic;
@@ -114,7 +113,7 @@ impl Session {
     pub(super) fn listed(&self, what: &What, setup: &Setup) -> Arc<[QuantityInfo]> {
         let (mut loaded, name) = self.loaded(what, "");
         let changes = Changes { set: setup.set.clone(), unjudged: true, ..Changes::default() };
-        compile::quantities(&mut loaded, &project::Disk, &name, &changes).unwrap_or_default().into()
+        compile::quantities(&mut loaded, &crate::disk::Disk, &name, &changes).unwrap_or_default().into()
     }
 
     /// Explains a quantity, a part, an experiment or a model: the explanation, and the path within it; no path for a
@@ -136,11 +135,11 @@ impl Session {
             return Ok((explanation, Some(String::new())));
         }
         let head = name.split(['.', '[']).next().unwrap_or(name);
-        let own = compile::load(TEXT, &self.text("", "").0, &project::Disk);
+        let own = compile::load(TEXT, &self.text("", "").0, &crate::disk::Disk);
         let texts = [&own].into_iter().chain(self.used.iter().rev().map(|used| &used.loaded));
         for loaded in texts.clone() {
             if let Lookup::Found(item, Item::Model(_)) = loaded.find(loaded.root(), Space::Type, head) {
-                let explanation = compile::explain_in(loaded, &project::Disk, head, item.file);
+                let explanation = compile::explain_in(loaded, &crate::disk::Disk, head, item.file);
                 return explanation
                     .map(|explanation| (explanation, None))
                     .map_err(|errors| found(loaded, &errors, name, None));
@@ -173,7 +172,7 @@ impl Session {
             _ => Vec::new(),
         };
         let changes = Changes { set, unjudged: true, ..Changes::default() };
-        compile::explain_run(&mut loaded, &project::Disk, &experiment, &changes)
+        compile::explain_run(&mut loaded, &crate::disk::Disk, &experiment, &changes)
             .map_err(|errors| found(&loaded, &errors, typed, None))
     }
 
@@ -197,7 +196,7 @@ impl Session {
     pub fn model(&self, name: &str) -> Option<ast::Model> {
         let name = self.parts.iter().find(|part| part.name == name).map_or(name, |part| &part.instance);
         let name = &model_of(name);
-        let own = compile::load(TEXT, &self.items.join("\n"), &project::Disk);
+        let own = compile::load(TEXT, &self.items.join("\n"), &crate::disk::Disk);
         let texts = [&own].into_iter().chain(self.used.iter().rev().map(|used| &used.loaded));
         texts.into_iter().find_map(|loaded| match loaded.find(loaded.root(), Space::Type, name) {
             Lookup::Found(_, Item::Model(model)) => Some(model.clone()),
@@ -207,7 +206,7 @@ impl Session {
 
     /// Visible models and interfaces.
     pub fn models(&self) -> Vec<String> {
-        let own = compile::load(TEXT, &self.items.join("\n"), &project::Disk);
+        let own = compile::load(TEXT, &self.items.join("\n"), &crate::disk::Disk);
         own.visible(own.root(), Space::Type).into_iter().map(str::to_string).collect()
     }
 
@@ -218,7 +217,7 @@ impl Session {
 
     /// The place of an experiment with this name: among the session's own, or in the file in use, last first.
     pub(super) fn experiment(&self, name: &str) -> Result<What, Fault> {
-        let own = compile::load(TEXT, &self.items.join("\n"), &project::Disk);
+        let own = compile::load(TEXT, &self.items.join("\n"), &crate::disk::Disk);
         if own.experiments().iter().any(|experiment| experiment.name == name) {
             return Ok(What::Experiment(None, name.into()));
         }
@@ -250,7 +249,7 @@ impl Session {
 
     /// Names of all experiments.
     pub fn experiments(&self) -> Vec<String> {
-        let own = compile::load(TEXT, &self.items.join("\n"), &project::Disk);
+        let own = compile::load(TEXT, &self.items.join("\n"), &crate::disk::Disk);
         let of = |loaded: &Loaded| loaded.experiments().into_iter().map(|experiment| experiment.name);
         of(&own).chain(self.used.iter().flatten_experiments()).collect()
     }
@@ -277,11 +276,11 @@ impl Session {
     pub fn lints(&self) -> Vec<(Vec<SourceFile>, Vec<Diagnostic>)> {
         let of = |used: &Used| {
             let mut loaded = used.loaded.clone();
-            let found = compile::check(&mut loaded, &project::Disk);
+            let found = compile::check(&mut loaded, &crate::disk::Disk);
             (loaded.files.0, found)
         };
         let (text, ..) = self.text("", "");
-        let own = Used { path: TEXT.into(), loaded: compile::load(TEXT, &text, &project::Disk) };
+        let own = Used { path: TEXT.into(), loaded: compile::load(TEXT, &text, &crate::disk::Disk) };
         self.used.iter().chain([&own]).map(of).filter(|(_, found)| !found.is_empty()).collect()
     }
 }

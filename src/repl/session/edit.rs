@@ -35,7 +35,7 @@ impl Session {
         if self.items.is_empty() {
             return false;
         }
-        let loaded = compile::load(TEXT, &self.items.join("\n"), &project::Disk);
+        let loaded = compile::load(TEXT, &self.items.join("\n"), &crate::disk::Disk);
         !matches!(loaded.find(loaded.root(), Space::Type, name), Lookup::Missing)
     }
 
@@ -52,9 +52,11 @@ impl Session {
         }
         next.items.push(item.trim_end().to_string());
         let (text, at, _) = next.text("", "");
-        let mut loaded = compile::load(TEXT, &text, &project::Disk);
-        let diagnostics: Vec<Diagnostic> =
-            compile::check(&mut loaded, &project::Disk).into_iter().filter(|found| concerns(&loaded, found)).collect();
+        let mut loaded = compile::load(TEXT, &text, &crate::disk::Disk);
+        let diagnostics: Vec<Diagnostic> = compile::check(&mut loaded, &crate::disk::Disk)
+            .into_iter()
+            .filter(|found| concerns(&loaded, found))
+            .collect();
         if diagnostics.iter().any(Diagnostic::is_error) {
             return Err(found(&loaded, &diagnostics, item, Some(at)));
         }
@@ -77,16 +79,16 @@ impl Session {
         next.items.retain(|item| *item != import);
         next.items.push(import.clone());
         let (text, at, _) = next.text("", "");
-        let loaded = compile::load(TEXT, &text, &project::Disk);
+        let loaded = compile::load(TEXT, &text, &crate::disk::Disk);
         if loaded.has_errors() {
             return Err(found(&loaded, &loaded.diagnostics, &import, Some(at)));
         }
-        let alone = compile::load(TEXT, &import, &project::Disk);
+        let alone = compile::load(TEXT, &import, &crate::disk::Disk);
         let mut models: Vec<&str> = alone.visible(alone.root(), Space::Type);
         if !library {
             let path = Path::new(bare);
             let text = project::read(path).map_err(|why| Fault::Words(format!("cannot read {bare}: {why}")))?;
-            let loaded = compile::load(bare, &text, &project::Disk);
+            let loaded = compile::load(bare, &text, &crate::disk::Disk);
             next.used.retain(|used| used.path != bare);
             next.used.push(Used { path: bare.into(), loaded });
         }
@@ -116,13 +118,13 @@ impl Session {
                     (read.model.text, read.args.into_iter().map(|arg| arg.name.text).collect::<Vec<_>>())
                 }
                 _ => {
-                    let mut loaded = compile::load(TEXT, "", &project::Disk);
+                    let mut loaded = compile::load(TEXT, "", &crate::disk::Disk);
                     loaded.files.0[0].text = instance.as_str().into();
                     return Err(found(&loaded, &errors, &instance, Some(0)));
                 }
             }
         };
-        let loaded = compile::load(TEXT, &self.text("", "").0, &project::Disk);
+        let loaded = compile::load(TEXT, &self.text("", "").0, &crate::disk::Disk);
         let open = match loaded.find(loaded.root(), Space::Type, &model) {
             Lookup::Found(_, Item::Model(model)) => open_inputs(model)
                 .into_iter()
@@ -138,7 +140,7 @@ impl Session {
         next.parts.push(Part { name: name.into(), instance: instance.clone(), open: open.clone() });
         let (text, _, at) = next.text("", &run(MODEL, 1.0));
         let typed = with_inputs(&instance, open.iter().map(|name| (name.as_str(), "0")));
-        let mut loaded = compile::load(TEXT, &text, &project::Disk);
+        let mut loaded = compile::load(TEXT, &text, &crate::disk::Disk);
         let case = next.compiled_in(&mut loaded, EXPERIMENT, &next.bench, &[], true);
         let (case, _) = case.map_err(|mut errors| {
             // Suggest models of the library as well as those in use.
@@ -205,7 +207,7 @@ impl Session {
         for used in &mut next.used {
             let text = project::read(Path::new(&used.path))
                 .map_err(|why| Fault::Words(format!("cannot read {}: {why}", used.path)))?;
-            used.loaded = compile::load(&used.path, &text, &project::Disk);
+            used.loaded = compile::load(&used.path, &text, &crate::disk::Disk);
             if used.loaded.has_errors() {
                 let found = used.loaded.diagnostics.clone();
                 return Err(Fault::Found(used.loaded.files.0.clone(), found));

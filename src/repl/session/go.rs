@@ -6,7 +6,7 @@
 use super::words::{Value, rewired, unit_as_typed};
 use super::{Fault, Session, Setup, What, begin, found};
 use crate::compile::{self, Case, Changes, Options, QuantityInfo, Varying};
-use crate::{project, quantity};
+use crate::quantity;
 use abi::plan::{Method, Series};
 use abi::unit::Unit;
 use abi::{Function, Instance, Slot};
@@ -214,7 +214,7 @@ impl Session {
         };
         let options = Options { changes, interpret: true };
         let mut warnings = Vec::new();
-        let cases = compile::compile(&mut loaded, &project::Disk, &name, &options, &mut warnings, &mut |_| ())
+        let cases = compile::compile(&mut loaded, &crate::disk::Disk, &name, &options, &mut warnings, &mut |_| ())
             .map_err(|errors| found(&loaded, &errors, "", None))?;
         let case = cases.into_iter().next().expect("there is a case");
         let mut instance = case.instance;
@@ -311,7 +311,7 @@ impl Session {
         };
         let options = Options { changes, interpret: false };
         let mut warnings = Vec::new();
-        let varying = compile::varying(&mut loaded, &project::Disk, &name, &options, &mut warnings)
+        let varying = compile::varying(&mut loaded, &crate::disk::Disk, &name, &options, &mut warnings)
             .map_err(|errors| found(&loaded, &errors, shows, None))?;
         let varying: Varying = varying.into_iter().next().expect("there is a case");
         let series = varying.plots.last().map_or(Vec::new(), |plot| plot.series.clone());

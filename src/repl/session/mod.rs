@@ -19,7 +19,6 @@ pub use go::{Cut, Ran};
 pub use words::{Value, plain};
 
 use crate::compile::{self, Case, Changes, Loaded, Options, QuantityInfo, SourceFile};
-use crate::project;
 use abi::{Instance, Slot};
 use grammar::diagnostic::{Diagnostic, Label};
 use grammar::span::{FileId, Span};
@@ -225,14 +224,16 @@ impl Session {
     fn loaded(&self, what: &What, more: &str) -> (Loaded, String) {
         match what {
             What::Experiment(Some(file), name) => (self.used[*file].loaded.clone(), name.clone()),
-            What::Experiment(None, name) => (compile::load(TEXT, &self.text(more, "").0, &project::Disk), name.clone()),
+            What::Experiment(None, name) => {
+                (compile::load(TEXT, &self.text(more, "").0, &crate::disk::Disk), name.clone())
+            }
             What::Session => {
                 let text = self.text(more, &run(MODEL, 1.0)).0;
-                (compile::load(TEXT, &text, &project::Disk), EXPERIMENT.into())
+                (compile::load(TEXT, &text, &crate::disk::Disk), EXPERIMENT.into())
             }
             What::Typed(instance) => {
                 let text = self.text(more, &format!("experiment {EXPERIMENT} {{\n  run {instance} for 1 s\n}}")).0;
-                (compile::load(TEXT, &text, &project::Disk), EXPERIMENT.into())
+                (compile::load(TEXT, &text, &crate::disk::Disk), EXPERIMENT.into())
             }
         }
     }
@@ -256,7 +257,7 @@ impl Session {
         };
         let mut warnings = Vec::new();
         let options = Options { changes, interpret: question };
-        let cases = compile::compile(loaded, &project::Disk, name, &options, &mut warnings, &mut |_| ())
+        let cases = compile::compile(loaded, &crate::disk::Disk, name, &options, &mut warnings, &mut |_| ())
             .map_err(|errors| if errors.is_empty() { loaded.diagnostics.clone() } else { errors })?;
         Ok((cases, warnings))
     }

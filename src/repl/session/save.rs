@@ -4,7 +4,6 @@
 
 use super::{Fault, MODEL, Session, What, found};
 use crate::compile::{self, Loaded};
-use crate::project;
 use grammar::ast::{self, Item};
 use grammar::diagnostic::Diagnostic;
 
@@ -44,8 +43,8 @@ impl Session {
             text += &format!("  {line}\n");
         }
         text += "}\n";
-        let mut loaded = compile::load(name, &text, &project::Disk);
-        let diagnostics = compile::check(&mut loaded, &project::Disk);
+        let mut loaded = compile::load(name, &text, &crate::disk::Disk);
+        let diagnostics = compile::check(&mut loaded, &crate::disk::Disk);
         if diagnostics.iter().any(Diagnostic::is_error) {
             return Err(Fault::Found(loaded.files.0, diagnostics));
         }
