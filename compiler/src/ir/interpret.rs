@@ -3,12 +3,14 @@
 //! In: functions, a block and a pool of constants. Out: the changed block and the status. Every back end must agree
 //! with it to the bit.
 
+use crate::ir::cfg::{Area, BlockId, Cfg, Count, Inst, Place, Terminator};
 use crate::ir::eval::evaluate;
 use crate::ir::verify::{Stage, verify};
-use crate::ir::{Func, Op};
+use crate::ir::{Func, Op, Value};
 use abi::table::Interpret;
 use abi::{Function, Layout};
 use std::cell::Cell;
+use std::collections::HashMap;
 
 thread_local! {
     /// Scratch space for the values of a function, kept from call to call.
@@ -118,6 +120,123 @@ fn run(func: &Func, block: &mut [f64], pool: &[f64], values: &mut [u64]) -> u64 
         block[write.base.index() + index as usize] = f64::from_bits(values[write.value.index()]);
     }
     func.status.map_or(0, |status| values[status.index()])
+}
+
+/// Runs a graph for a number of iterations and returns its status: the reference for the passes over graphs. It has no
+/// values of a leading loop.
+///
+/// # Panics
+/// If a value is used before it is available: a mistake of a pass.
+pub fn run_cfg(cfg: &Cfg, count: u64, block: &mut [f64], pool: &[f64]) -> u64 {
+    let mut scratch = vec![0; cfg.scratch_len as usize];
+    let mut graph = Graph { cfg, count, block, pool, scratch: &mut scratch };
+    if count == 0 { 0 } else { graph.run(BlockId(0)) }
+}
+
+/// Runs the entry that computes values after the block, if the graph has one.
+pub fn prepare_cfg(cfg: &Cfg, block: &mut [f64], pool: &[f64]) {
+    if let Some(entry) = cfg.prepare {
+        Graph { cfg, count: 1, block, pool, scratch: &mut [] }.run(entry);
+    }
+}
+
+/// A graph that is being interpreted.
+struct Graph<'a> {
+    cfg: &'a Cfg,
+    count: u64,
+    block: &'a mut [f64],
+    pool: &'a [f64],
+    scratch: &'a mut [u64],
+}
+
+impl Graph<'_> {
+    fn run(&mut self, entry: BlockId) -> u64 {
+        let cfg = self.cfg;
+        let (mut values, mut id): (HashMap<Value, u64>, BlockId) = (HashMap::new(), entry);
+        // The repetition of the loop, from 0.
+        let mut repetition = 0;
+        loop {
+            let block = &cfg.blocks[id.index()];
+            for inst in &block.insts {
+                match inst {
+                    Inst::Compute(value) => _ = values.insert(*value, self.operation(cfg.op(*value), &values)),
+                    Inst::Reload(value, place) => {
+                        let at = Self::index(place, repetition);
+                        let bits = match place.area {
+                            Area::Block => self.block[at].to_bits(),
+                            Area::Scratch => self.scratch[at],
+                            Area::Leading => unreachable!("there is no leading loop"),
+                        };
+                        values.insert(*value, bits);
+                    }
+                    Inst::Store(place, value) => {
+                        let (at, bits) = (Self::index(place, repetition), self.value(*value, &values));
+                        match place.area {
+                            Area::Block => self.block[at] = f64::from_bits(bits),
+                            Area::Scratch => self.scratch[at] = bits,
+                            Area::Leading => unreachable!("only the leading loop writes there"),
+                        }
+                    }
+                    Inst::Write(write) => {
+                        let index = self.value(write.index, &values).min(u64::from(write.len) - 1);
+                        let bits = self.value(write.value, &values);
+                        self.block[write.base.index() + index as usize] = f64::from_bits(bits);
+                    }
+                    Inst::Call(piece) => _ = self.run(cfg.pieces[*piece]),
+                }
+            }
+            let next = match &block.end {
+                Terminator::Jump(target) => target.clone(),
+                Terminator::Branch { when, yes, no } => {
+                    if self.value(*when, &values) == 0 {
+                        no.clone()
+                    } else {
+                        yes.clone()
+                    }
+                }
+                Terminator::Switch { slot, cases, default } => {
+                    let held = self.block[slot.index()].to_bits();
+                    cases.iter().find(|(bits, _)| *bits == held).map_or(*default, |(_, block)| *block).into()
+                }
+                Terminator::Repeat { count, again, done } => {
+                    repetition += 1;
+                    let all = if let Count::Fixed(all) = count { *all } else { self.count };
+                    if repetition < all { again.clone() } else { done.clone() }
+                }
+                Terminator::Return(status) => return status.map_or(0, |status| self.value(status, &values)),
+            };
+            let args: Vec<u64> = next.args.iter().map(|arg| self.value(*arg, &values)).collect();
+            values.extend(cfg.blocks[next.block.index()].params.iter().copied().zip(args));
+            id = next.block;
+        }
+    }
+
+    fn index(place: &Place, repetition: u64) -> usize {
+        (i64::from(place.index) + place.stride * repetition as i64) as usize
+    }
+
+    fn value(&self, value: Value, values: &HashMap<Value, u64>) -> u64 {
+        match values.get(&value) {
+            Some(bits) => *bits,
+            None if self.cfg.is_free(value) => self.operation(self.cfg.op(value), values),
+            None => panic!("{value} is not available\n{}", self.cfg),
+        }
+    }
+
+    fn operation(&self, op: Op, values: &HashMap<Value, u64>) -> u64 {
+        let entry = |base: u32, len: u32, index: Value| {
+            let index = self.value(index, values).min(u64::from(len) - 1);
+            base as usize + index as usize
+        };
+        match op {
+            Op::Load(slot) => self.block[slot.index()].to_bits(),
+            Op::Pool { base, len, index } => self.pool[entry(base, len, index)].to_bits(),
+            Op::Ring { base, len, index } => self.block[entry(base.0, len, index)].to_bits(),
+            // The bits of a table entry are read directly.
+            Op::ToBits(table) if let entry @ Op::Pool { .. } = self.cfg.op(table) => self.operation(entry, values),
+            op => evaluate(op, |operand| self.value(operand, values)).expect("elementary functions are expanded"),
+        }
+    }
 }
 
 #[cfg(test)]

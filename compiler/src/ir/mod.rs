@@ -12,6 +12,9 @@ pub mod eval;
 pub mod build;
 pub mod partial_eval;
 pub mod variance;
+pub mod cfg;
+pub mod cfg_text;
+pub mod cfg_verify;
 pub mod expr;
 pub mod interpret;
 pub mod program;
@@ -333,8 +336,13 @@ impl Func {
     /// The condition that selects the status, its truth value in case of a failure, and the status in that case; the
     /// status is 0 otherwise. `None` if there is no status or if it has another form.
     pub fn failure(&self) -> Option<(Value, bool, Value)> {
-        let Op::Select(when, yes, no) = self.op(self.status?) else { return None };
-        let is_zero = |value: Value| self.op(value) == Op::Int(0);
+        Func::failure_of(&self.ops, self.status?)
+    }
+
+    /// As [`failure`](Func::failure), of operations and their status.
+    pub fn failure_of(ops: &[Op], status: Value) -> Option<(Value, bool, Value)> {
+        let Op::Select(when, yes, no) = ops[status.index()] else { return None };
+        let is_zero = |value: Value| ops[value.index()] == Op::Int(0);
         match (is_zero(yes), is_zero(no)) {
             (_, true) => Some((when, true, yes)),
             (true, false) => Some((when, false, no)),

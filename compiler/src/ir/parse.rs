@@ -5,7 +5,7 @@
 //! [`verify`](super::verify) checks that values exist and types match.
 
 use super::{Binary, Func, Op, Unary, Value, Write};
-use abi::Slot;
+use abi::{Layout, Slot};
 use std::collections::HashMap;
 use std::fmt;
 use std::str::FromStr;
@@ -48,6 +48,26 @@ pub fn parse(text: &str) -> Result<Func, ParseError> {
         Line::of(line).read(&mut func, &mut section).map_err(|cause| ParseError { line: number, cause })?;
     }
     Ok(func)
+}
+
+/// Parses the segments of a block as test files write them: `params 1, states 2`.
+///
+/// # Errors
+/// What is no segment or no length.
+pub fn parse_layout(text: &str) -> Result<Layout, String> {
+    const SEGMENTS: [&str; 10] =
+        ["params", "inputs", "states", "memory", "regimes", "outputs", "derivatives", "roots", "jacobian", "due"];
+    let (mut lens, mut rings) = ([0; 10], 0);
+    for part in text.split(", ") {
+        let (name, len) = part.split_once(' ').ok_or(format!("expected a segment and its length, not `{part}`"))?;
+        let len: u32 = len.parse().map_err(|_| format!("`{len}` is no length"))?;
+        match SEGMENTS.iter().position(|segment| *segment == name) {
+            Some(at) => lens[at] = len,
+            None if name == "rings" => rings = len,
+            None => return Err(format!("no segment `{name}`")),
+        }
+    }
+    Ok(Layout::new(lens).with_rings(rings))
 }
 
 /// The sections of a listing, in their order.
@@ -104,17 +124,17 @@ static NAMED: LazyLock<HashMap<String, Op>> = LazyLock::new(|| {
 });
 
 /// The unread rest of a line. Its tokens are words and single other characters.
-struct Line<'t> {
+pub(super) struct Line<'t> {
     rest: &'t str,
 }
 
 impl<'t> Line<'t> {
-    fn of(line: &'t str) -> Line<'t> {
+    pub(super) fn of(line: &'t str) -> Line<'t> {
         Line { rest: line.split(';').next().unwrap_or_default() }
     }
 
     /// The next token; empty at the end of the line.
-    fn token(&mut self) -> &'t str {
+    pub(super) fn token(&mut self) -> &'t str {
         let rest = self.rest.trim_start();
         let is_word = |c: char| c.is_alphanumeric() || ['_', '.', '+', '-'].contains(&c);
         let word = rest.find(|c| !is_word(c)).unwrap_or(rest.len());
@@ -125,28 +145,33 @@ impl<'t> Line<'t> {
         token
     }
 
-    fn expect(&mut self, expected: &str) -> Result<(), String> {
+    /// The next token, which stays unread.
+    pub(super) fn peek(&self) -> &'t str {
+        Line { rest: self.rest }.token()
+    }
+
+    pub(super) fn expect(&mut self, expected: &str) -> Result<(), String> {
         let token = self.token();
         if token == expected { Ok(()) } else { Err(unexpected(&format!("`{expected}`"), token)) }
     }
 
     /// An integer; `kind` names it in messages.
-    fn number<T: FromStr>(&mut self, kind: &str) -> Result<T, String> {
+    pub(super) fn number<T: FromStr>(&mut self, kind: &str) -> Result<T, String> {
         let token = self.token();
         token.parse().ok().filter(|_| !token.starts_with('+')).ok_or_else(|| unexpected(kind, token))
     }
 
-    fn slot(&mut self) -> Result<Slot, String> {
+    pub(super) fn slot(&mut self) -> Result<Slot, String> {
         self.number("a slot").map(Slot)
     }
 
-    fn value(&mut self) -> Result<Value, String> {
+    pub(super) fn value(&mut self) -> Result<Value, String> {
         let token = self.token();
         value(token).ok_or_else(|| unexpected("a value", token))
     }
 
     /// `BASE[INDEX < LEN]`, of a table or a ring.
-    fn entry(&mut self) -> Result<(u32, Value, u32), String> {
+    pub(super) fn entry(&mut self) -> Result<(u32, Value, u32), String> {
         let base = self.number("the first entry")?;
         self.expect("[")?;
         let index = self.value()?;
@@ -156,7 +181,7 @@ impl<'t> Line<'t> {
         Ok((base, index, len))
     }
 
-    fn end(&mut self) -> Result<(), String> {
+    pub(super) fn end(&mut self) -> Result<(), String> {
         match self.token() {
             "" => Ok(()),
             token => Err(unexpected("the end of the line", token)),
@@ -201,7 +226,7 @@ impl<'t> Line<'t> {
     }
 
     /// The operation after `vN =`.
-    fn op(&mut self) -> Result<Op, String> {
+    pub(super) fn op(&mut self) -> Result<Op, String> {
         Ok(match self.token() {
             "int" => Op::Int(self.number("an integer")?),
             "true" => Op::Bool(true),
@@ -256,13 +281,13 @@ impl<'t> Line<'t> {
 }
 
 /// `vN`
-fn value(token: &str) -> Option<Value> {
+pub(super) fn value(token: &str) -> Option<Value> {
     let digits = token.strip_prefix('v').filter(|digits| !digits.starts_with('+'))?;
     digits.parse().ok().map(Value)
 }
 
 /// The message that something else was expected.
-fn unexpected(expected: &str, token: &str) -> String {
+pub(super) fn unexpected(expected: &str, token: &str) -> String {
     match token {
         "" => format!("expected {expected}, but the line ends"),
         token => format!("expected {expected}, not `{token}`"),
