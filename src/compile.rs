@@ -108,13 +108,13 @@ pub fn emit(
 /// A table of the passes: what each did to the step, and how long it took.
 fn passes(built: &Built, method: Method) -> String {
     let mut out = format!("; {}, by {}\n", built.program.description.name, method.name());
-    out += &format!("{:<18} {:>6} {:>6} {:>9}\n", "pass", "before", "after", "time");
+    out += &format!("{:<18} {:>6} {:>6} {:>6} {:>9}\n", "pass", "before", "after", "blocks", "time");
     let mut begin = Instant::now();
-    compiler::codegen::passes::each(&built.program, method, &mut |ran| {
+    compiler::codegen::pass_report::each(&built.program, method, &mut |ran| {
         let time = crate::quantity::duration(begin.elapsed().as_secs_f64(), 3);
         let [before, after] = ran.ops;
-        out += &format!("{:<18} {before:>6} {after:>6} {time:>9}  {}", ran.name, ran.does);
-        out += &ran.effect.map_or("\n".into(), |effect| format!(": {effect}\n"));
+        let blocks = ran.blocks.map_or(String::new(), |blocks| blocks.to_string());
+        out += &format!("{:<18} {before:>6} {after:>6} {blocks:>6} {time:>9}  {}\n", ran.name, ran.does);
         begin = Instant::now();
     });
     out

@@ -1,13 +1,16 @@
 //! Tests that every back end returns the same bits as the interpreter.
 
 use super::jit::{compile, compile_prepared, compile_with};
-use super::target::{FunctionCompiler, with};
-use crate::codegen::emit::Facts;
+use super::target::{self, FunctionCompiler};
+use crate::codegen::forms::{Context, Form, Options};
 use crate::codegen::lanes::{self, Width};
-use crate::codegen::outline::{Lengths, outline};
+use crate::codegen::outline::Lengths;
+use crate::codegen::passes;
 use crate::codegen::unswitch::unswitchable;
 use crate::ir::build::Build;
+use crate::ir::cfg::{Area, BlockId, Cfg, Entry as Called, Inst, Place};
 use crate::ir::interpret::Interpreter;
+use crate::ir::parse::{parse, parse_layout};
 use crate::ir::random::{self, POOL_LEN, REALS, Random};
 use crate::ir::{Func, Op, Unary, Value};
 use crate::math;
@@ -15,6 +18,7 @@ use abi::image::Target;
 use abi::lanes::Batch;
 use abi::table::Interpret;
 use abi::{Code, Function, Layout, Slot};
+use std::path::Path;
 use std::sync::Arc;
 
 /// Whether two blocks are equal to the bit; all NaN count as equal.
@@ -40,7 +44,7 @@ fn check_outlined(
     what: &str,
 ) {
     let funcs = [(Function::Step, func.clone())];
-    let machine = Code::Machine(compile_with(&funcs, layout, pool.len(), lengths, false).unwrap().0);
+    let machine = Code::Machine(compile_with(&funcs, layout, pool.len(), &with(lengths), false).unwrap().0);
     let reference = Code::Interpreted(Arc::new(Interpreter::new(&funcs, layout, pool.len())));
     for start in blocks {
         let (mut found, mut expected) = (start.clone(), start.clone());
@@ -55,34 +59,122 @@ fn check_outlined(
     }
 }
 
-/// Three inputs, four states.
-fn layout() -> Layout {
-    Layout::new([0, 3, 4, 0, 0, 0, 0, 0, 0, 0])
+/// Settings with these lengths.
+fn with(lengths: Lengths) -> Options {
+    Options { lengths, ..Options::default() }
 }
 
-/// A mode that each step sets to 0 or 1 without selecting its old value, which the step still compares.
-#[test]
-fn a_mode_is_read_before_it_is_set() {
-    let layout = Layout::new([0, 2, 1, 0, 1, 0, 0, 0, 0, 0]);
-    let (x, regime) = (layout.states.slot(0), layout.regimes.slot(0));
-    let mut build = Build::new("step");
-    let [v, w] = [0, 1].map(|k| build.load(layout.inputs.slot(k)));
-    let [zero, one] = [0.0, 1.0].map(|number| build.real(number));
-    let (mut next, was) = (build.load(x), build.load(regime));
-    let rests = build.equal(was, zero);
-    for factor in [v, w, v, w] {
-        let product = build.mul(next, factor);
-        let moved = build.add(product, w);
-        next = build.select(rests, moved, next);
+/// The graph of an outlined function.
+fn outlined(func: &Func, lengths: Lengths) -> Cfg {
+    let options = with(lengths);
+    passes::run(func, Form::Long, Called::Several, &Context { layout: None, options: &options })
+}
+
+/// A case of `tests/ir/agreement/*.ir`: a function, and the blocks from which it starts.
+///
+/// ```text
+/// ; What is special about it.
+/// ; block: inputs 2, states 1      the segments of the block, as in the files of passes
+/// ; pool: 1.0, 2.0                 the pool, if it reads one
+/// ; slot 3: 0.5, edges             numbers of a slot: each is combined with those of all others; `edges` are special numbers
+/// ```
+struct Case {
+    func: Func,
+    layout: Layout,
+    pool: Vec<f64>,
+    blocks: Vec<Vec<f64>>,
+}
+
+impl Case {
+    fn read(text: &str) -> Case {
+        let numbers = |list: &str| -> Vec<f64> {
+            let number = |word: &str| match word {
+                "edges" => REALS.to_vec(),
+                word => vec![word.parse().unwrap_or_else(|_| panic!("`{word}` is no number"))],
+            };
+            list.split(", ").flat_map(number).collect()
+        };
+        let (mut layout, mut pool, mut blocks) = (Layout::default(), Vec::new(), Vec::new());
+        for line in text.lines().filter_map(|line| line.strip_prefix("; ")) {
+            match line.split_once(": ") {
+                Some(("block", segments)) => {
+                    layout = parse_layout(segments).unwrap();
+                    blocks = vec![vec![0.0; layout.size()]];
+                }
+                Some(("pool", list)) => pool = numbers(list),
+                Some((slot, list)) if let Some(slot) = slot.strip_prefix("slot ") => {
+                    let slot: usize = slot.parse().expect("a slot");
+                    let with = |block: &Vec<f64>, number: f64| {
+                        let mut block = block.clone();
+                        block[slot] = number;
+                        block
+                    };
+                    let all = numbers(list);
+                    blocks =
+                        blocks.iter().flat_map(|block| all.iter().map(move |number| with(block, *number))).collect();
+                }
+                _ => {}
+            }
+        }
+        Case { func: parse(text).unwrap_or_else(|error| panic!("{error}\n{text}")), layout, pool, blocks }
     }
-    let less = build.less(v, w);
-    let set = build.select(less, one, zero);
-    build.store(x, next);
-    build.store(regime, set);
-    // −0 equals mode 0.
-    let regimes = [0.0, -0.0, 1.0].into_iter().flat_map(|regime| [[2.0, 3.0, regime], [3.0, 2.0, regime]]);
-    let blocks: Vec<Vec<f64>> = regimes.map(|[v, w, regime]| vec![0.0, 1.0, 0.0, v, w, 5.0, regime]).collect();
-    check(&build.finish(), &layout, &blocks, &[], 1, "a regime that is set");
+}
+
+/// Each function of the files, on the interpreter, as a loop, as a single step with hoisted parameters, and in lanes of all
+/// widths.
+#[test]
+fn functions_of_files_agree() {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/ir/agreement");
+    let (mut files, mut steps) = (0, 0);
+    for path in std::fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()) {
+        let name = path.display().to_string();
+        let Case { func, layout, pool, blocks } = Case::read(&std::fs::read_to_string(&path).unwrap());
+        for count in [1, 3, 40] {
+            check(&func, &layout, &blocks, &pool, count, &format!("{name}, {count} iterations"));
+        }
+        files += 1;
+        steps += blocks.len();
+        let funcs = [(Function::Step, func.clone())];
+        let reference = Interpreter::new(&funcs, &layout, pool.len());
+        let code = compile_prepared(&funcs, &layout, pool.len()).unwrap().0;
+        for start in &blocks {
+            let (mut found, mut expected) = (start.clone(), start.clone());
+            let expected_status = reference.call(Function::Step, &mut expected, &pool, 1);
+            if let Some(prepared) = code.prepared() {
+                found.resize(start.len() + prepared.len, f64::NAN);
+                let status = code.step_prepared(&mut found, &pool, false).expect("it has such a step");
+                assert_eq!(status, expected_status, "{name} from {start:?}");
+                assert!(same(&found[..start.len()], &expected), "{name} from {start:?}: {found:?}, not {expected:?}");
+            }
+        }
+        for width in Width::ALL.into_iter().filter(|width| width.is_here()) {
+            let mut batch =
+                Batch::new(lanes::compile(&func, &layout, pool.len(), width, 1).expect("this processor can"));
+            for starts in blocks.chunks(batch.width()) {
+                starts.iter().enumerate().for_each(|(lane, start)| batch.load(lane, start));
+                batch.advance(&pool, 1);
+                for (lane, start) in starts.iter().enumerate() {
+                    let (mut expected, mut found) = (start.clone(), start.clone());
+                    reference.call(Function::Step, &mut expected, &pool, 1);
+                    batch.save(lane, &mut found);
+                    assert!(same(&found, &expected), "{name}, {width:?}: {found:?} instead of {expected:?}");
+                }
+            }
+        }
+    }
+    println!("{files} files, {steps} blocks");
+    assert!(files >= 8 && steps > 2000, "{files} files, {steps} blocks");
+}
+
+/// Unswitching finds what four springs share.
+#[test]
+fn four_springs_are_unswitched() {
+    let texts = [
+        include_str!("../../../tests/ir/agreement/springs_1.ir"),
+        include_str!("../../../tests/ir/agreement/springs_4.ir"),
+    ];
+    let found = texts.map(|text| unswitchable(&Case::read(text).func).is_some());
+    assert_eq!(found, [false, true]);
 }
 
 /// Each operation on reals, on every pair of edge values.
@@ -91,7 +183,7 @@ fn every_operation_on_reals_agrees_at_the_edges() {
     let of_two: [fn(Value, Value) -> Op; 7] = [Op::Add, Op::Sub, Op::Mul, Op::Div, Op::Less, Op::LessEqual, Op::Equal];
     let of_one: [fn(Value) -> Op; 7] =
         [Op::Neg, Op::Abs, Op::Sqrt, Op::Floor, Op::Nearest, Op::ToInt, |a| Op::Fma(a, a, a)];
-    let layout = layout();
+    let layout = Layout::new([0, 3, 4, 0, 0, 0, 0, 0, 0, 0]);
     let blocks: Vec<Vec<f64>> =
         REALS.iter().flat_map(|a| REALS.iter().map(|b| vec![0.0, 0.0, 0.0, *a, *b, 0.3, 0.0, 0.0, 0.0, 0.0])).collect();
     let ops = of_two.map(|of| of(Value(0), Value(1))).into_iter().chain(of_one.map(|of| of(Value(0))));
@@ -111,59 +203,6 @@ fn every_operation_on_reals_agrees_at_the_edges() {
         };
         func.stores = vec![(Slot(6), Value(result))];
         check(&func, &layout, &blocks, &[], 1, "an operation");
-    }
-}
-
-/// min and max as selects become one instruction, which must also treat zeros and NaN as the select does.
-#[test]
-fn minimum_and_maximum_agree_at_the_edges() {
-    let mut build = Build::new("extremes");
-    let (x, y, z) = (build.load(Slot(3)), build.load(Slot(4)), build.load(Slot(5)));
-    let values = [build.min(x, y), build.max(x, y), build.clamp(x, y, z), build.sign(x)];
-    for (i, value) in values.into_iter().enumerate() {
-        build.store(Slot(6 + i as u32), value);
-    }
-    let blocks: Vec<Vec<f64>> =
-        REALS.iter().flat_map(|a| REALS.iter().map(|b| vec![0.0, 0.0, 0.0, *a, *b, 1.0, 0.0, 0.0, 0.0, 0.0])).collect();
-    check(&build.finish(), &layout(), &blocks, &[], 1, "extremes");
-}
-
-/// Back ends recognise the select form of the sign and replace it: also at ±0 and NaN.
-#[test]
-fn signs_agree_at_the_edges() {
-    let layout = Layout::new([0, 0, 1, 0, 0, 3, 0, 0, 0, 0]);
-    let mut build = Build::new("signs");
-    let (x, two) = (build.load(Slot(3)), build.real(2.0));
-    // A state, so that iterations differ and the loop remains.
-    let next = build.mul(x, two);
-    build.store(Slot(3), next);
-    // Several signs: of operands that are also read elsewhere, some of them later, the last one not.
-    for (slot, of) in [(4, x), (5, next)] {
-        let sign = build.sign(of);
-        build.store(Slot(slot), sign);
-    }
-    let other = build.sub(next, two);
-    let [first, second] = [build.sign(other), build.mul(other, x)];
-    let last = build.fma(first, second, x);
-    build.store(Slot(6), last);
-    let func = build.finish();
-    let below = |x: &f64| [*x, -x, 1.0f64.next_up() * x, f64::from_bits(1) * x];
-    let blocks: Vec<Vec<f64>> = REALS.iter().flat_map(below).map(|x| vec![0.0, 0.0, 0.0, x, 0.0, 0.0, 0.0]).collect();
-    check(&func, &layout, &blocks, &[], 1, "signs");
-    let alone = Interpreter::new(&[(Function::Step, func.clone())], &layout, 0);
-    for width in Width::ALL.into_iter().filter(|width| width.is_here()) {
-        let lanes = lanes::compile(&func, &layout, 0, width, 1).expect("this processor can");
-        let mut batch = Batch::new(lanes);
-        for starts in blocks.chunks(batch.width()) {
-            starts.iter().enumerate().for_each(|(lane, start)| batch.load(lane, start));
-            batch.advance(&[], 1);
-            for (lane, start) in starts.iter().enumerate() {
-                let (mut expected, mut found) = (start.clone(), start.clone());
-                alone.call(Function::Step, &mut expected, &[], 1);
-                batch.save(lane, &mut found);
-                assert!(same(&found, &expected), "{width:?}: {found:?} instead of {expected:?}");
-            }
-        }
     }
 }
 
@@ -205,7 +244,6 @@ fn outlined_functions_agree() {
         let mut random = Random(seed);
         let (func, pool, layout, blocks) = random_program(&mut random);
         let least = 1 + random.below(8);
-        let facts = Facts::of(&func);
         let lengths = Lengths {
             max_function: 0,
             min_piece: least,
@@ -213,9 +251,9 @@ fn outlined_functions_agree() {
             max_scratch: u32::MAX,
             min_repetitions: 2,
         };
-        let all = outline(&func, &facts, lengths).expect("there is room");
-        let again = outline(&func, &facts, Lengths { max_scratch: all.scratch_len.saturating_sub(1), ..lengths });
-        let max_scratch = again.map_or(all.scratch_len, |outlined| outlined.scratch_len);
+        let all = outlined(&func, lengths);
+        let again = outlined(&func, Lengths { max_scratch: all.scratch_len.saturating_sub(1), ..lengths });
+        let max_scratch = if again.pieces.is_empty() { all.scratch_len } else { again.scratch_len };
         for max_scratch in [all.scratch_len, max_scratch] {
             let what = format!("seed {seed}, {lengths:?} with {max_scratch} doubles of scratch");
             check_outlined(
@@ -229,10 +267,16 @@ fn outlined_functions_agree() {
             );
         }
         pieces += all.pieces.len();
-        crossing += all.scratch_slots.len();
+        crossing += scratch_stores(&all);
     }
     println!("{pieces} pieces, {crossing} values that cross");
     assert!(pieces > 10_000 && crossing > 10_000);
+}
+
+/// Number of values that pieces store for others.
+fn scratch_stores(cfg: &Cfg) -> usize {
+    let stores = |inst: &&Inst| matches!(inst, Inst::Store(place, _) if place.area == Area::Scratch);
+    cfg.blocks.iter().flat_map(|block| &block.insts).filter(stores).count()
 }
 
 /// A function of `copies` copies of a random function. Each copy has slots of its own, at constant strides; some slots
@@ -314,11 +358,20 @@ fn rerolled_loops_agree() {
             max_scratch: u32::MAX,
             min_repetitions: 2 + random.below(2),
         };
-        let outlined = outline(&func, &Facts::of(&func), lengths).expect("there is room");
-        loops += outlined.pieces.iter().filter(|piece| !piece.rows.is_empty()).count();
-        rows += outlined.pieces.iter().map(|piece| piece.rows.len()).sum::<usize>();
-        stores += outlined.pieces.iter().map(|piece| piece.row_stores.len()).sum::<usize>();
-        tables += outlined.repeats.tables.len();
+        let cfg = outlined(&func, lengths);
+        assert!(!cfg.pieces.is_empty(), "there is room");
+        let of_loop = |piece: &&BlockId| cfg.head(&cfg.order(**piece)).is_some();
+        for piece in cfg.pieces.iter().filter(of_loop) {
+            loops += 1;
+            for inst in cfg.order(*piece).iter().flat_map(|block| &cfg.blocks[block.index()].insts) {
+                match inst {
+                    Inst::Compute(_) => rows += 1,
+                    Inst::Store(Place { area: Area::Block, .. }, _) => stores += 1,
+                    Inst::Reload(value, _) => tables += usize::from(cfg.op(*value) == Op::Load(Slot(u32::MAX))),
+                    _ => {}
+                }
+            }
+        }
         let count = 1 + random.below(5) as u64;
         check_outlined(
             &func,
@@ -422,43 +475,6 @@ fn constants_of_special_bits_agree() {
         };
         let blocks: Vec<Vec<f64>> = (k..k + 5).map(block).collect();
         check(&build.finish(), &layout, &blocks, &[], 1, &format!("constant {bits:#x}"));
-    }
-}
-
-/// Parameters in adjacent slots, some of which are also read alone.
-#[test]
-fn adjacent_parameters_agree() {
-    let layout = Layout::new([5, 1, 1, 0, 0, 2, 0, 0, 0, 0]);
-    let mut build = Build::new("pairs");
-    let p: [Value; 5] = std::array::from_fn(|k| build.load(layout.params.slot(k)));
-    let [u, x] = [layout.inputs.slot(0), layout.states.slot(0)].map(|slot| build.load(slot));
-    let ratio = build.div(p[4], p[3]);
-    let moved = build.fma(p[1], u, x);
-    let held = build.min(p[2], moved);
-    let beyond = build.less(p[0], held);
-    let next = build.select(beyond, p[0], held);
-    build.store(layout.states.slot(0), next);
-    for (slot, with) in [(0, p[1]), (1, ratio)] {
-        let output = build.mul(next, with);
-        build.store(layout.outputs.slot(slot), output);
-    }
-    let funcs = [(Function::Step, build.finish())];
-    let code = compile_prepared(&funcs, &layout, 0).unwrap().0;
-    let len = code.prepared().expect("a single step has code of its own").len;
-    assert_eq!(len, 1, "a ratio of parameters");
-    let reference = Interpreter::new(&funcs, &layout, 0);
-    for (k, number) in REALS.iter().enumerate() {
-        for other in REALS {
-            let mut block = vec![0.0; layout.size()];
-            block[layout.params.range()].copy_from_slice(&[*number, *other, 2.0, REALS[(k + 5) % REALS.len()], 3.0]);
-            block[layout.inputs.slot(0).index()] = *other;
-            block[layout.states.slot(0).index()] = *number;
-            let (mut found, mut expected) = (block.clone(), block);
-            found.resize(expected.len() + len, f64::NAN);
-            let status = code.step_prepared(&mut found, &[], false).expect("it has such a step");
-            assert_eq!(status, reference.call(Function::Step, &mut expected, &[], 1));
-            assert!(same(&found[..expected.len()], &expected), "{found:?} instead of {expected:?}");
-        }
     }
 }
 
@@ -601,7 +617,7 @@ fn lanes_agree_with_single_instances() {
 #[test]
 fn lanes_of_two_compile_for_any_target() {
     for target in [Target::X86_64, Target::Aarch64] {
-        let isa = with(target, &[]);
+        let isa = target::with(target, &[]);
         let mut coder = FunctionCompiler::new(&isa);
         let mut made = 0;
         for seed in 0..600 {
@@ -652,145 +668,5 @@ fn exponentials_in_lanes_agree_with_single_instances() {
                 assert!(same(&found, &expected), "{width:?}, x = {x:e}: {found:?} instead of {expected:?}");
             }
         }
-    }
-}
-
-/// The residual output of a mode may be a value that is already computed: inside an arm of a select, or as the bits of
-/// a table entry.
-#[test]
-fn a_residual_output_may_be_computed_already() {
-    let layout = Layout::new([0, 1, 5, 0, 0, 0, 0, 0, 0, 0]);
-    let mut build = Build::new("regimes");
-    let (x, regime) = (build.load(Slot(3)), build.load(Slot(4)));
-    let [zero, one] = [0.0, 1.0].map(|number| build.real(number));
-    let size = build.abs(x);
-    let mut long = size;
-    for _ in 0..8 {
-        long = build.fma(long, size, one);
-    }
-    let small = build.less(x, one);
-    let chosen = build.select(small, long, x);
-    build.store(Slot(5), chosen);
-    let (bits, mask) = (build.op(Op::ToBits(x)), build.int(3));
-    let index = build.op(Op::IntAnd(bits, mask));
-    let entry = build.op(Op::Pool { base: 0, len: 4, index });
-    let bits = build.op(Op::ToBits(entry));
-    let sticks = build.equal(regime, zero);
-    let other = build.fma(x, x, one);
-    let turned = build.select(sticks, x, other);
-    let output = build.abs(turned);
-    build.store(Slot(6), output);
-    let mut more = turned;
-    for _ in 0..6 {
-        more = build.fma(more, turned, x);
-    }
-    build.store(Slot(7), more);
-    let (none, some) = (build.int(0), build.int(1));
-    let added = build.select(sticks, none, some);
-    let sum = build.op(Op::IntAdd(bits, added));
-    let of_table = build.op(Op::FromBits(sum));
-    build.store(Slot(8), of_table);
-    let next = build.select(small, regime, one);
-    build.store(Slot(4), next);
-    let blocks: Vec<Vec<f64>> = [0.0, 1.0, 7.0]
-        .into_iter()
-        .flat_map(|regime| [-0.5, 0.7, 3.0].map(|x| vec![0.0, 0.0, 0.0, x, regime, 0.0, 0.0, 0.0, 0.0]))
-        .collect();
-    for count in [1, 3] {
-        check(&build.clone().finish(), &layout, &blocks, &[1.0, 2.0, 3.0, 4.0], count, "regimes");
-    }
-}
-
-/// Springs with three modes each (stuck, and sliding at ±1) at the speed in slot 3. The layout has their states, then
-/// their modes, then the sum of their forces, which a guard tests.
-fn springs(number: u32) -> (Func, Layout) {
-    let layout = Layout::new([0, 1, number, 0, number, 1, 0, 0, 0, 0]);
-    let mut build = Build::new("springs");
-    let v = build.load(layout.inputs.slot(0));
-    let [zero, one, two, minus_one] = [0.0, 1.0, 2.0, -1.0].map(|number| build.real(number));
-    let [forth, back] = [build.less(zero, v), build.less(v, zero)];
-    let mut sum = None;
-    for k in 0..number as usize {
-        let [state, slot] = [layout.states.slot(k), layout.regimes.slot(k)];
-        let [f, regime] = [state, slot].map(|slot| build.load(slot));
-        let [sticks, slides, slides_back] = [zero, one, two].map(|number| build.equal(regime, number));
-        let moved = build.add(f, v);
-        let moved = build.select(sticks, moved, f);
-        let [above, below] = [build.less(one, moved), build.less(moved, minus_one)];
-        let yields = |build: &mut Build, beyond, direction| {
-            let both = build.and(beyond, direction);
-            build.and(sticks, both)
-        };
-        let [up, down] = [yields(&mut build, above, forth), yields(&mut build, below, back)];
-        let [turns, turns_back] = [build.and(slides, back), build.and(slides_back, forth)];
-        let mut next = regime;
-        for (when, number) in [(turns, zero), (turns_back, zero), (down, two), (up, one)] {
-            next = build.select(when, number, next);
-        }
-        let held = build.select(down, minus_one, moved);
-        let f = build.select(up, one, held);
-        build.store(state, f);
-        build.store(slot, next);
-        sum = Some(sum.map_or(f, |sum| build.add(sum, f)));
-    }
-    let sum = sum.unwrap();
-    build.store(layout.outputs.slot(0), sum);
-    fails_unless_finite(&mut build, sum);
-    (build.finish(), layout)
-}
-
-/// Any number may stand in the slot of a mode, also −0 and numbers of no mode: for one automaton, and for four with an
-/// unswitched direction.
-#[test]
-fn any_number_in_the_slot_of_a_mode_agrees() {
-    let numbers = [0.0, -0.0, 1.0, 2.0, 7.0, f64::NAN];
-    for count in [1, 4] {
-        let (func, layout) = springs(count);
-        assert_eq!(unswitchable(&func).is_some(), count > 1);
-        let mut blocks = Vec::new();
-        for v in [-0.7, -0.0, 0.0, 0.7, f64::NAN, f64::INFINITY] {
-            for f in [-1.5, -0.5, 0.0, 0.5, 1.5, f64::NAN] {
-                for (k, number) in numbers.into_iter().enumerate() {
-                    let count = count as usize;
-                    let mut block = vec![0.0, 1e-3, 0.0, v];
-                    block.extend(std::iter::repeat_n(f, count));
-                    // The automata after the first are in any of the modes.
-                    block
-                        .extend((0..count).map(|later| if later == 0 { number } else { numbers[(k + 2 * later) % 4] }));
-                    block.push(0.0);
-                    blocks.push(block);
-                }
-            }
-        }
-        for steps in [1, 3] {
-            check(&func, &layout, &blocks, &[], steps, &format!("{count} springs, {steps} steps"));
-        }
-    }
-}
-
-/// A loop carries more states than there are registers through the block.
-#[test]
-fn many_states_agree() {
-    let layout = Layout::new([0, 0, 60, 0, 0, 2, 0, 0, 0, 0]);
-    let mut build = Build::new("many");
-    let states: Vec<Value> = (0..60).map(|k| build.load(layout.states.slot(k))).collect();
-    let half = build.real(0.5);
-    for k in 0..60 {
-        let mixed = build.fma(states[(k + 7) % 60], half, states[k]);
-        // Some states only exchange places.
-        build.store(layout.states.slot(k), if k % 9 == 0 { states[(k + 1) % 60] } else { mixed });
-    }
-    build.store(layout.outputs.slot(0), states[3]);
-    let limit = build.real(1e3);
-    let over = build.less(limit, states[11]);
-    let (zero, code) = (build.int(0), build.int(4));
-    let status = build.select(over, code, zero);
-    build.status(status);
-    let mut random = Random(7);
-    let blocks: Vec<Vec<f64>> =
-        (0..20).map(|_| (0..layout.size()).map(|_| random.within(-9.0, 9.0)).collect()).collect();
-    let func = build.finish();
-    for count in [1, 2, 3, 40] {
-        check(&func, &layout, &blocks, &[], count, "many states");
     }
 }

@@ -6,11 +6,14 @@
 
 use super::target::{Bytes, FunctionCompiler, here};
 use crate::codegen::emit::signature;
-use crate::codegen::executable_memory::Memory;
-use crate::codegen::loop_distribution;
-use crate::codegen::outline::Lengths;
+use crate::codegen::executable_memory::{Executable, Memory};
+use crate::codegen::forms::{Context, Form, Options};
+use crate::codegen::lanes::{self, Width};
+use crate::codegen::passes;
 use crate::ir::Func;
+use crate::ir::cfg::{Entry as Called, Leading};
 use crate::ir::verify::{Stage, verify};
+use abi::ahead::{Ahead, RestEntry};
 use abi::table::{Entry, Machine, Prepared};
 use abi::{Function, Layout};
 use cranelift_module::Module;
@@ -30,7 +33,7 @@ pub struct Stats {
 /// # Panics
 /// If a function does not verify or is not expanded: a mistake of an earlier pass.
 pub fn compile(funcs: &[(Function, Func)], layout: &Layout, pool_len: usize) -> Result<(Machine, Stats), Unsupported> {
-    compile_with(funcs, layout, pool_len, Lengths::USUAL, false)
+    compile_with(funcs, layout, pool_len, &Options::default(), false)
 }
 
 /// Compiles as [`compile`] does, and also a single step with [hoisted parameter expressions](abi::table::Prepared). For
@@ -43,18 +46,21 @@ pub fn compile_prepared(
     layout: &Layout,
     pool_len: usize,
 ) -> Result<(Machine, Stats), Unsupported> {
-    compile_with(funcs, layout, pool_len, Lengths::USUAL, true)
+    compile_with(funcs, layout, pool_len, &Options::default(), true)
 }
 
-/// Compiles with given lengths for outlining; `prepares`: also a single step with hoisted parameter expressions.
-pub(super) fn compile_with(
+/// Compiles with given settings; `prepares`: also a single step with hoisted parameter expressions.
+///
+/// # Panics
+/// As `compile`.
+pub fn compile_with(
     funcs: &[(Function, Func)],
     layout: &Layout,
     pool_len: usize,
-    lengths: Lengths,
+    options: &Options,
     prepares: bool,
 ) -> Result<(Machine, Stats), Unsupported> {
-    let (entries, prepared, memory, stats) = generate(funcs, layout, pool_len, lengths, prepares)?;
+    let (entries, prepared, memory, stats) = generate(funcs, layout, pool_len, options, prepares)?;
     // SAFETY: the entries live as long as `memory`; `verify` has checked that every slot lies in the layout and every
     // table in the pool, table indices are clamped to the table, and code without calls does not unwind.
     let machine = unsafe { Machine::new(entries, layout.size(), pool_len, Arc::new(memory)) };
@@ -64,14 +70,38 @@ pub(super) fn compile_with(
         None => machine,
     };
     // Loop distribution does not pay for an outlined step: its leading loop would again be one long straight line.
-    let step =
-        funcs.iter().find(|(function, func)| *function == Function::Step && func.ops.len() <= lengths.max_function);
-    let machine = match step.and_then(|(_, step)| loop_distribution::compile(step, layout, pool_len)) {
+    let step = funcs
+        .iter()
+        .find(|(function, func)| *function == Function::Step && func.ops.len() <= options.lengths.max_function);
+    let machine = match step.and_then(|(_, step)| distributed(step, layout, pool_len, options)) {
         // SAFETY: it is the same step, distributed over two loops.
         Some(ahead) => unsafe { machine.with_ahead(ahead) },
         None => machine,
     };
     Ok((machine, stats))
+}
+
+/// Compiles a distributed step; none if distribution does not pay or this processor has no lanes. The lanes of the leading
+/// loop are successive instants of time.
+fn distributed(step: &Func, layout: &Layout, pool_len: usize, options: &Options) -> Option<Ahead> {
+    let graph = passes::run(step, Form::Distributed, Called::Several, &Context { layout: Some(layout), options });
+    let Leading { invariants, instants, layout: own, loads, .. } = &**graph.leading.as_ref()?;
+    let (invariants, instants) = Width::here_all().find_map(|width| {
+        let lanes = |func: &Func| lanes::compile(func, own, pool_len, width, width.vectors()).ok();
+        let instants = lanes(instants)?;
+        match invariants {
+            Some(invariants) => Some((Some(lanes(invariants)?), instants)),
+            None => Some((None, instants)),
+        }
+    })?;
+    let bytes = FunctionCompiler::new(here().ok()?).remaining_loop(step, &graph, instants.width()).ok()?;
+    let executable = Executable::new(&bytes.code, bytes.alignment as u64).ok()?;
+    // SAFETY: `address` is the start of code with the signature of `RestEntry`.
+    let entry = unsafe { std::mem::transmute::<*const u8, RestEntry>(executable.address()) };
+    // SAFETY: the entry lives as long as its memory; `loop_distribution` keeps every access to block and pool as it was in
+    // the step, which is verified, and loads one output of `own` for each value of the leading loop; code without calls
+    // does not unwind.
+    unsafe { Ahead::new(invariants, instants, own.clone(), loads.clone(), entry, Arc::new(executable)) }
 }
 
 type Entries = [Option<Entry>; Function::ALL.len()];
@@ -80,14 +110,14 @@ fn generate(
     funcs: &[(Function, Func)],
     layout: &Layout,
     pool_len: usize,
-    lengths: Lengths,
+    options: &Options,
     prepares: bool,
 ) -> Result<(Entries, Option<Prepared>, Memory, Stats), Unsupported> {
     let isa = here()?;
     let mut memory = Memory::new(isa);
     let module = memory.module();
     let mut compiler = FunctionCompiler::new(isa);
-    compiler.set_lengths(lengths);
+    compiler.set_options(options);
     let mut stats = Stats::default();
     let mut ids = Vec::new();
     let mut single = None;
@@ -159,7 +189,7 @@ mod tests {
         let next = build.add(x, x);
         build.store(Slot(3), next);
         let (entries, _, memory, stats) =
-            generate(&[(Function::Step, build.finish())], &layout, 0, Lengths::USUAL, false).unwrap();
+            generate(&[(Function::Step, build.finish())], &layout, 0, &Options::default(), false).unwrap();
         assert_eq!(stats.functions.len(), 1);
         let address = entries[Function::Step as usize].unwrap() as usize;
         let executable = || mapped("r-xp").iter().any(|range| range.contains(&address));

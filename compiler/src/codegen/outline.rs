@@ -1,8 +1,8 @@
 //! Outlining: divides a long function into pieces, because the time of register allocation grows faster than the length
 //! of a function.
 //!
-//! In: a verified, expanded function. Out: [`Outlined`]: the operations of each piece, the scratch slots through which
-//! pieces pass values, and the piece in which each slot of the block is stored. Operations that can be
+//! In: a function in one block. Out: a loop that calls pieces. Pieces pass values through scratch slots, and each slot of
+//! the block is stored by the first piece after which nothing reads it. Operations that can be
 //! [rerolled](crate::codegen::reroll) form a piece of their own, a loop. It knows nothing of processors.
 //!
 //! ```text
@@ -10,13 +10,16 @@
 //! iteration   all other operations; each slot is stored as soon as nothing reads it any more
 //! failure     operations that only the status needs; when its test reports a failed guard
 //! ```
-//! Values that cross a cut go through a scratch area. The order of operations keeps these few: the operations that one
-//! result needs are adjacent, and each cut is placed, within the allowed lengths, where the fewest values cross.
+//! The order of operations keeps the values that cross a cut few: the operations that one result needs are adjacent, and
+//! each cut is placed, within the allowed lengths, where the fewest values cross.
 //!
 //! Compare Zhao, Amaral, *Function Outlining and Partial Inlining*, SBAC-PAD 2005.
 
-use crate::codegen::emit::{ExitCondition, Facts};
-use crate::codegen::reroll::{Repeats, arithmetic_progression, repeats};
+use crate::codegen::form_loop::is_idempotent;
+use crate::codegen::reroll::{Repeats, Row, Source, arithmetic_progression, repeats};
+use crate::codegen::side_exit::{cold, tested};
+use crate::ir::cfg::{Area, Block, BlockId, Cfg, Count, Entry, Inst, Part, Place, Target, Terminator};
+use crate::ir::variance::{Variance, variance};
 use crate::ir::{Func, Op, Value, Write};
 use abi::Slot;
 use std::collections::{BTreeMap, HashMap, HashSet};
@@ -44,20 +47,245 @@ impl Lengths {
         Lengths { max_function: 2000, min_piece: 600, max_piece: 1200, max_scratch: 32_768, min_repetitions: 8 };
 }
 
+impl Default for Lengths {
+    fn default() -> Lengths {
+        Lengths::USUAL
+    }
+}
+
+/// Outlines a function; unchanged if the values that cross the cuts do not fit into the scratch area.
+pub fn outline(cfg: &mut Cfg, lengths: Lengths) {
+    let Some(func) = cfg.straight_line(BlockId(0)) else { return };
+    let variance = variance(&func, None);
+    // Loop invariants occupy their scratch slots through the whole call. If there are too many, each iteration computes
+    // them.
+    let divided = |once| Line::new(&func, &variance, once).outline(lengths);
+    if let Some(outlined) = [true, false].into_iter().map(divided).find(|cut| cut.scratch_len <= lengths.max_scratch) {
+        *cfg = Writer::new(&func, &outlined).write();
+    }
+}
+
+/// Writes the loop and its pieces.
+struct Writer<'a> {
+    func: &'a Func,
+    outlined: &'a Outlined,
+    cfg: Cfg,
+    /// The values that are available in the piece that is being written.
+    known: HashSet<Value>,
+    insts: Vec<Inst>,
+}
+
+impl<'a> Writer<'a> {
+    fn new(func: &'a Func, outlined: &'a Outlined) -> Writer<'a> {
+        let mut cfg = Cfg::straight(func, Entry::Several);
+        cfg.blocks.clear();
+        cfg.scratch_len = outlined.scratch_len;
+        Writer { func, outlined, cfg, known: HashSet::new(), insts: Vec::new() }
+    }
+
+    /// Makes a value of another piece available: reads it back from its scratch slot, or loads it again.
+    fn fetch(&mut self, value: Value) {
+        match (self.outlined.scratch_slots.get(&value), self.func.op(value)) {
+            _ if !self.known.insert(value) => {}
+            (Some(slot), _) => self.insts.push(Inst::Reload(value, Place::scratch(*slot))),
+            (None, Op::Load(_)) => self.insts.push(Inst::Compute(value)),
+            // Each use rematerialises a constant.
+            (None, _) => {}
+        }
+    }
+
+    /// Ends the block that is being written.
+    fn block(&mut self, part: Part, params: Vec<Value>, end: Terminator) -> BlockId {
+        let insts = std::mem::take(&mut self.insts);
+        self.cfg.block(Block { part, params, insts, end })
+    }
+
+    fn write(mut self) -> Cfg {
+        let iteration = self.outlined.iteration.clone();
+        let number = self.outlined.pieces.len();
+        let calls = |pieces: Range<usize>| pieces.map(Inst::Call);
+        let [head, latch, failed, exit] = [1, 2, 3, 4].map(BlockId);
+        self.insts.extend(calls(0..iteration.start));
+        self.block(Part::Prologue, Vec::new(), Terminator::Jump(head.into()));
+
+        let zero = self.func.status.map(|_| {
+            self.cfg.ops.push(Op::Int(0));
+            Value(self.cfg.ops.len() as u32 - 1)
+        });
+        let fine = Target { block: exit, args: zero.into_iter().collect() };
+        let (test, detail) = tested(self.func);
+        self.insts.extend(calls(iteration.clone()));
+        test.into_iter().for_each(|test| self.fetch(test));
+        let end = match (test, self.func.failure()) {
+            (None, _) => Terminator::Jump(latch.into()),
+            (Some(when), None) => {
+                Terminator::Branch { when, yes: Target { block: exit, args: vec![when] }, no: latch.into() }
+            }
+            (Some(when), Some((_, true, _))) => Terminator::Branch { when, yes: failed.into(), no: latch.into() },
+            (Some(when), Some((_, false, _))) => Terminator::Branch { when, yes: latch.into(), no: failed.into() },
+        };
+        self.block(Part::Body, Vec::new(), end);
+        // If no iteration reads what an iteration writes, one is enough.
+        let end = match is_idempotent(self.func) {
+            true => Terminator::Jump(fine),
+            false => Terminator::Repeat { count: Count::Call, again: head.into(), done: fine },
+        };
+        self.block(Part::Body, Vec::new(), end);
+        self.insts.extend(calls(iteration.end..number));
+        detail.into_iter().for_each(|detail| self.fetch(detail));
+        let end = match detail {
+            Some(when) => Terminator::Branch { when, yes: Target { block: exit, args: vec![when] }, no: latch.into() },
+            None => Terminator::Jump(latch.into()),
+        };
+        self.block(Part::Cold, Vec::new(), end);
+        let status = self.func.status;
+        self.block(Part::Prologue, status.into_iter().collect(), Terminator::Return(status));
+        for number in 0..number {
+            let entry = self.piece(number);
+            self.cfg.pieces.push(entry);
+        }
+        self.cfg
+    }
+
+    /// Writes a piece; returns its entry.
+    fn piece(&mut self, number: usize) -> BlockId {
+        let piece = &self.outlined.pieces[number];
+        self.known.clear();
+        let part = match number {
+            number if number < self.outlined.iteration.start => Part::Prologue,
+            number if number < self.outlined.iteration.end => Part::Body,
+            _ => Part::Cold,
+        };
+        for (table, slot) in self.outlined.repeats.tables.iter().zip(&self.outlined.tables).filter(|_| number == 0) {
+            let store = |(value, slot): (&Value, u32)| Inst::Store(Place::scratch(slot), *value);
+            self.insts.extend(table.iter().zip(*slot..).map(store));
+        }
+        for value in &piece.ops {
+            self.func.reads(self.func.op(*value)).for_each(|read| self.fetch(read));
+            self.insts.push(Inst::Compute(*value));
+            self.known.insert(*value);
+            // Other pieces load the bits of a table entry by themselves.
+            if let Some(slot) = self.outlined.scratch_slots.get(value).filter(|_| self.outlined.as_real[value.index()])
+            {
+                self.insts.push(Inst::Store(Place::scratch(*slot), *value));
+            }
+        }
+        let written = piece.writes.iter().flat_map(|write| [write.index, write.value]);
+        piece.stores.iter().map(|(_, value)| *value).chain(written).for_each(|value| self.fetch(value));
+        self.insts.extend(piece.stores.iter().map(|(slot, value)| Inst::Store(Place::slot(*slot), *value)));
+        self.insts.extend(piece.writes.iter().map(|write| Inst::Write(*write)));
+        if piece.rows.is_empty() {
+            return self.block(part, Vec::new(), Terminator::Return(None));
+        }
+        self.rerolled(piece, part)
+    }
+
+    /// Writes the loop of a rerolled piece. Its body has the values of the first repetition.
+    fn rerolled(&mut self, piece: &Piece, part: Part) -> BlockId {
+        let rows: Vec<&Row> = piece.rows.iter().map(|row| &self.outlined.repeats.rows[*row]).collect();
+        let firsts: HashSet<Value> = rows.iter().map(|row| row.members[0]).collect();
+        let slot = |value: Value| self.outlined.scratch_slots[&value];
+        let at = |area: Area, index: u32, stride: i64| Place { area, index, stride };
+        let (mut same, mut inputs): (Vec<Value>, Vec<(Value, Place)>) = (Vec::new(), Vec::new());
+        // Constants that differ among the repetitions: the operation, the index of the operand, and the place.
+        let mut constants: HashMap<(Value, usize), Place> = HashMap::new();
+        for row in &rows {
+            let first = row.members[0];
+            let mut operands: Vec<Value> = self.func.reads(self.func.op(first)).collect();
+            if let Op::Load(_) = self.func.op(first) {
+                operands.push(first);
+            }
+            for (n, (operand, source)) in operands.into_iter().zip(&row.sources).enumerate() {
+                match *source {
+                    Source::Same(value) => same.push(value),
+                    Source::Slots(first, stride) => inputs.push((operand, at(Area::Block, first.0, stride))),
+                    Source::Table(table) => {
+                        let place = at(Area::Scratch, self.outlined.tables[table], 1);
+                        constants.insert((first, n), place);
+                    }
+                    Source::Scratch(first, _) if firsts.contains(&first) => {}
+                    Source::Scratch(first, second) => {
+                        let stride = i64::from(slot(second)) - i64::from(slot(first));
+                        inputs.push((operand, at(Area::Scratch, slot(first), stride)));
+                    }
+                }
+            }
+        }
+        inputs.sort_unstable_by_key(|(value, _)| *value);
+        inputs.dedup();
+        let mut outputs: Vec<(Place, Value)> = Vec::new();
+        for first in rows.iter().map(|row| row.members[0]) {
+            if let Some(slot) = self.outlined.scratch_slots.get(&first) {
+                outputs.push((at(Area::Scratch, *slot, 1), first));
+            }
+        }
+        for (slot, stride, row) in &piece.row_stores {
+            outputs.push((at(Area::Block, slot.0, *stride), self.outlined.repeats.rows[*row].members[0]));
+        }
+        same.into_iter().for_each(|value| self.fetch(value));
+        let head = BlockId(self.cfg.blocks.len() as u32 + 1);
+        let after = BlockId(head.0 + 1);
+        let entry = self.block(part, Vec::new(), Terminator::Jump(head.into()));
+
+        let read: HashSet<Value> = inputs.iter().map(|(value, _)| *value).collect();
+        self.insts.extend(inputs.into_iter().map(|(value, place)| Inst::Reload(value, place)));
+        // The operations of the body, where an operand that is a constant of a table gives the operation a new value.
+        let mut renamed: HashMap<Value, Value> = HashMap::new();
+        for first in rows.iter().map(|row| row.members[0]).filter(|value| !read.contains(value)) {
+            let (op, mut n) = (self.func.op(first), 0);
+            let op = op.map(|operand| {
+                let place = constants.get(&(first, n));
+                n += 1;
+                match place {
+                    Some(place) => {
+                        let value = self.cfg.in_memory();
+                        self.insts.push(Inst::Reload(value, *place));
+                        value
+                    }
+                    None => match (renamed.get(&operand), self.func.op(operand)) {
+                        (Some(value), _) => *value,
+                        // An entry of which only the bits are read belongs to no row: its index may.
+                        (None, Op::Pool { base, len, index }) if let Some(index) = renamed.get(&index) => {
+                            self.cfg.ops.push(Op::Pool { base, len, index: *index });
+                            Value(self.cfg.ops.len() as u32 - 1)
+                        }
+                        (None, _) => operand,
+                    },
+                }
+            });
+            let value = if op == self.func.op(first) {
+                first
+            } else {
+                self.cfg.ops.push(op);
+                Value(self.cfg.ops.len() as u32 - 1)
+            };
+            renamed.insert(first, value);
+            self.insts.push(Inst::Compute(value));
+        }
+        let value = |first: Value| renamed.get(&first).copied().unwrap_or(first);
+        self.insts.extend(outputs.into_iter().map(|(place, first)| Inst::Store(place, value(first))));
+        let count = Count::Fixed(rows[0].members.len() as u64);
+        let end = Terminator::Repeat { count, again: head.into(), done: after.into() };
+        self.block(part, Vec::new(), end);
+        self.block(part, Vec::new(), Terminator::Return(None));
+        entry
+    }
+}
+
 /// Operations that are compiled as one function.
-#[derive(Clone, PartialEq, Debug, Default)]
-pub struct Piece {
+#[derive(Clone, Default)]
+struct Piece {
     /// The operations, in order. Constants are not among them, nor most loads: each piece rematerialises those it
     /// reads.
-    pub ops: Vec<Value>,
+    ops: Vec<Value>,
     /// Stores at the end of the piece; all values are read before the first store.
-    pub stores: Vec<(Slot, Value)>,
+    stores: Vec<(Slot, Value)>,
     /// Writes to rings after the stores.
-    pub writes: Vec<Write>,
+    writes: Vec<Write>,
     /// If not empty, the piece is a loop over these rows and the fields above are empty.
-    pub rows: Vec<usize>,
+    rows: Vec<usize>,
     /// Rows that the loop stores to slots of the block, a member in each repetition: first slot, stride, row.
-    pub row_stores: Vec<(Slot, i64, usize)>,
+    row_stores: Vec<(Slot, i64, usize)>,
 }
 
 impl Piece {
@@ -69,31 +297,22 @@ impl Piece {
 }
 
 /// A function in pieces.
-#[derive(Clone, PartialEq, Debug)]
-pub struct Outlined {
+struct Outlined {
     /// The rows of the loops.
-    pub repeats: Repeats,
+    repeats: Repeats,
     /// The pieces in execution order.
-    pub pieces: Vec<Piece>,
+    pieces: Vec<Piece>,
     /// The pieces that run in each iteration. Those before them run once per call, those after them when a guard has
     /// failed.
-    pub iteration: Range<usize>,
+    iteration: Range<usize>,
     /// The scratch slot of each value that crosses a cut.
-    pub scratch_slots: HashMap<Value, u32>,
+    scratch_slots: HashMap<Value, u32>,
     /// First scratch slot of each constant table of the loops; the first piece fills them.
-    pub tables: Vec<u32>,
+    tables: Vec<u32>,
     /// Size of the scratch area, in doubles.
-    pub scratch_len: u32,
-}
-
-/// Outlines a function; none if the values that cross the cuts do not fit into the scratch area.
-pub fn outline(func: &Func, facts: &Facts, lengths: Lengths) -> Option<Outlined> {
-    // Loop invariants occupy their scratch slots through the whole call. If there are too many, each iteration computes
-    // them.
-    [true, false]
-        .into_iter()
-        .map(|once| Line::new(func, facts, once).outline(lengths))
-        .find(|cut| cut.scratch_len <= lengths.max_scratch)
+    scratch_len: u32,
+    /// For each table entry, whether anything reads it as a real; other operations read only its bits.
+    as_real: Vec<bool>,
 }
 
 /// Whether each piece that reads the value rematerialises it.
@@ -108,15 +327,14 @@ fn is_rematerialised(func: &Func, value: Value) -> bool {
 /// The operations of a function in the order in which the pieces compute them.
 struct Line<'a> {
     func: &'a Func,
-    exit_condition: ExitCondition,
     invariant: Vec<Value>,
     iteration: Vec<Value>,
     failure: Vec<Value>,
 }
 
 impl<'a> Line<'a> {
-    fn new(func: &'a Func, facts: &Facts, once: bool) -> Line<'a> {
-        let (exit_condition, cold) = ExitCondition::of(func);
+    fn new(func: &'a Func, variance: &[Variance], once: bool) -> Line<'a> {
+        let cold = cold(func);
         let stored: HashMap<Slot, Value> = func.stores.iter().copied().collect();
         // Loads that cannot be rematerialised, because the failure pieces read them after their slot may have been
         // stored.
@@ -138,18 +356,18 @@ impl<'a> Line<'a> {
         // The failure pieces need these values from before the stores, so the iteration reads them.
         let read =
             values(func).filter(|value| needed_on_failure[value.index()] || matches!(func.op(*value), Op::Ring { .. }));
-        let (tested, detail) = exit_condition.values();
+        let (tested, detail) = tested(func);
         for root in rest.into_iter().map(|(_, value)| value).chain(written).chain(tested).chain(read) {
             order.visit(root, None);
         }
         let own = |value: &Value| needed_on_failure[value.index()] || !is_rematerialised(func, *value);
         let (mut iteration, mut invariant) = (Vec::new(), Vec::new());
         for value in order.take().filter(own) {
-            if once && !facts.is_variant[value.index()] { &mut invariant } else { &mut iteration }.push(value);
+            if once && variance[value.index()].is_invariant() { &mut invariant } else { &mut iteration }.push(value);
         }
         detail.into_iter().for_each(|detail| order.visit(detail, None));
         let failure = order.take().filter(own).collect();
-        Line { func, exit_condition, invariant, iteration, failure }
+        Line { func, invariant, iteration, failure }
     }
 
     fn outline(&self, lengths: Lengths) -> Outlined {
@@ -174,7 +392,12 @@ impl<'a> Line<'a> {
             len - table.len() as u32
         };
         let tables = repeats.tables.iter().map(place).collect();
-        Outlined { repeats, pieces, iteration: range, scratch_slots, tables, scratch_len: len }
+        let mut as_real: Vec<bool> = self.func.ops.iter().map(|op| !matches!(op, Op::Pool { .. })).collect();
+        for op in self.func.ops.iter().filter(|op| !matches!(op, Op::ToBits(_))) {
+            op.each_operand(|operand| as_real[operand.index()] = true);
+        }
+        self.func.results().for_each(|value| as_real[value.index()] = true);
+        Outlined { repeats, pieces, iteration: range, scratch_slots, tables, scratch_len: len, as_real }
     }
 
     /// Divides operations into pieces: alternately straight pieces and loops, level by level.
@@ -325,7 +548,7 @@ impl<'a> Line<'a> {
 
     /// The values that are tested after an iteration.
     fn tested(&self) -> impl Iterator<Item = Value> {
-        let (first, second) = self.exit_condition.values();
+        let (first, second) = tested(self.func);
         first.into_iter().chain(second)
     }
 

@@ -1,156 +1,97 @@
-//! The list of all passes from a program to machine code, in order, with their effects: `fric build --emit passes`.
+//! The passes over control-flow graphs, in the order in which they run: from a straight-line function to what is emitted.
 //!
-//! In: a program and a method. Out: one report for each pass. The passes before code generation are listed in
-//! [`opt::PASSES`] and run from there. Those of code generation run during emission, because they need control flow;
-//! [`LATE`] lists them with their conditions. Their effects on the step are counted by the functions that emission
-//! calls.
+//! In: a function and the form of code that is wanted. Out: its graph. The compiler runs this list, `fric build --emit
+//! passes` prints it, and docs/machine-code.md explains it. The passes before, over straight lines, are
+//! [`opt::PASSES`](crate::opt::PASSES).
 
-use crate::codegen::emit::{ExitCondition, Facts};
-use crate::codegen::hoist_params::Hoisted;
-use crate::codegen::outline::{Lengths, outline};
-use crate::codegen::select_to_branch::BranchRegions;
+use crate::codegen::drop_counter::drop_counter;
+use crate::codegen::form_loop::form_loop;
+use crate::codegen::forms::{Context, Form};
+use crate::codegen::hoist_invariants::hoist_invariants;
+use crate::codegen::hoist_params::hoist_params;
+use crate::codegen::loop_distribution::loop_distribution;
+use crate::codegen::outline::outline;
+use crate::codegen::select_to_branch::select_to_branch;
+use crate::codegen::side_exit::side_exit;
 use crate::codegen::sink::sink;
-use crate::codegen::specialise_modes::{modes, specialise};
-use crate::codegen::unswitch::unswitchable;
-use crate::codegen::{loop_distribution, tiering};
-use crate::ir::program::Program;
-use crate::ir::{Func, Value};
-use crate::numerics::fixed_step;
-use crate::opt::{self, Context};
-use crate::{math, numerics};
-use abi::Layout;
-use abi::plan::Method;
+use crate::codegen::specialise_modes::specialise_modes;
+use crate::codegen::unswitch::unswitch;
+use crate::ir::Func;
+use crate::ir::cfg::{Cfg, Entry};
+use crate::ir::cfg_verify::verify_cfg;
+use Form::{Distributed, Long, Loop, Once, Single};
 
-/// A pass of code generation.
-pub struct Late {
+/// A pass over a graph.
+pub struct Pass {
     /// The name of its module.
     pub name: &'static str,
-    /// What the pass does and when it runs.
+    /// What it does, in one sentence.
     pub does: &'static str,
-    effect: fn(&Func, &Layout) -> Option<String>,
+    /// The forms of code for which it runs.
+    pub on: &'static [Form],
+    run: fn(&mut Cfg, &Context),
 }
 
-impl Late {
-    /// What it does with a step, in words. The step is expanded.
-    pub fn effect(&self, func: &Func, layout: &Layout) -> String {
-        (self.effect)(func, layout).unwrap_or_else(|| "nothing to do".into())
-    }
+const fn pass(name: &'static str, on: &'static [Form], run: fn(&mut Cfg, &Context), does: &'static str) -> Pass {
+    Pass { name, does, on, run }
 }
 
-/// The passes of code generation, in order.
-pub static LATE: [Late; 7] = [
-    Late {
-        name: "hoist_params",
-        does: "computes expressions of parameters and the step length once; for single steps in memory",
-        effect: |func, layout| {
-            let count = Hoisted::of(func, layout).prepare.stores.len();
-            (count > 0).then(|| format!("{count} values hoisted"))
-        },
-    },
-    Late {
-        name: "unswitch",
-        does: "copies the step for each answer to a comparison that three automata or more test",
-        effect: |func, _| unswitchable(func).map(|_| "a copy for each answer".into()),
-    },
-    Late {
-        name: "specialise_modes",
-        does: "makes a residual step for each mode of an automaton, and a switch between them",
-        effect: |func, _| {
-            let (exit_condition, cold) = ExitCondition::of(func);
-            let automata = specialise(func, &modes(func), &cold, exit_condition.values().0).automata;
-            let modes: usize = automata.iter().map(|automaton| automaton.cases.len()).sum();
-            (modes > 0).then(|| format!("{modes} modes of {} automata", automata.len()))
-        },
-    },
-    Late {
-        name: "sink",
-        does: "moves cheap operations on loads down to their first use, for lower register pressure",
-        effect: |func, _| {
-            let before = operations(func);
-            let moved = before.iter().zip(sink(&func.ops, &before)).filter(|(a, b)| *a != b).count();
-            (moved > 0).then(|| format!("{moved} places in the order changed"))
-        },
-    },
-    Late {
-        name: "select_to_branch",
-        does: "turns selections with an expensive arm into branches that compute one arm",
-        effect: |func, _| {
-            let results: Vec<Value> = func.results().collect();
-            let count = BranchRegions::of(&func.ops, &operations(func), &results).arms.len();
-            (count > 0).then(|| format!("{count} branches"))
-        },
-    },
-    Late {
-        name: "outline",
-        does: "cuts functions of more than 2,000 operations into pieces; repeated parts become loops (reroll)",
-        effect: |func, _| {
-            let lengths = Lengths::USUAL;
-            let outlined = if func.ops.len() > lengths.max_function {
-                outline(func, &Facts::of(func), lengths)?
-            } else {
-                return None;
-            };
-            Some(format!(
-                "{} pieces, {} rows of repeated operations",
-                outlined.pieces.len(),
-                outlined.repeats.rows.len()
-            ))
-        },
-    },
-    Late {
-        name: "loop_distribution",
-        does: "computes what depends on time alone in a leading vectorised loop; for many steps in one call",
-        effect: |func, layout| {
-            let distribution = loop_distribution::split(func, layout.size())?;
-            Some(format!("{} operations in the leading loop", distribution.leading.ops.len()))
-        },
-    },
+/// The passes, in order. First those that need the function in one block, then those that give it more, then those on any
+/// number of blocks.
+#[rustfmt::skip]
+pub static LATE: [Pass; 11] = [
+    pass("drop_counter", &[Single], |cfg, _| drop_counter(cfg),
+        "leaves the step counter to the caller"),
+    pass("hoist_params", &[Single], |cfg, context| _ = context.layout.map(|layout| hoist_params(cfg, layout)),
+        "computes expressions of parameters and the step length once; in memory"),
+    pass("loop_distribution", &[Distributed], |cfg, context| _ = context.layout.map(|layout| loop_distribution(cfg, layout)),
+        "computes what depends on time alone in a leading vectorised loop"),
+    pass("unswitch", &[Single], |cfg, _| unswitch(cfg),
+        "copies the step for each answer to a comparison that three automata or more test"),
+    pass("specialise_modes", &[Single, Once], |cfg, _| specialise_modes(cfg),
+        "makes a residual step for each mode of an automaton, and a switch between them"),
+    pass("outline", &[Long], |cfg, context| outline(cfg, context.options.lengths),
+        "cuts the function into pieces; repeated parts become loops (reroll)"),
+    pass("form_loop", &[Loop, Distributed], |cfg, _| form_loop(cfg),
+        "wraps the step in a loop that carries its states in registers"),
+    // After the loop, so that what only the status needs is not taken for an invariant.
+    pass("side_exit", &[Single, Once, Loop, Distributed], |cfg, _| side_exit(cfg),
+        "moves what only the status of a failed guard needs to a cold block"),
+    pass("hoist_invariants", &[Loop, Distributed], |cfg, _| hoist_invariants(cfg),
+        "computes what no step changes before the loop"),
+    pass("sink", &[Single, Once], |cfg, _| sink(cfg),
+        "moves cheap operations on loads down to their first use, for lower register pressure"),
+    // Last, because the passes before find selects easier to read than branches.
+    pass("select_to_branch", &[Single, Once, Loop, Long, Distributed], |cfg, _| select_to_branch(cfg),
+        "turns selections with an expensive arm into branches that compute one arm"),
 ];
 
-/// All live operations of a function, in order.
-fn operations(func: &Func) -> Vec<Value> {
-    let live = func.live();
-    (0..func.ops.len()).filter(|i| live[*i]).map(|i| Value(i as u32)).collect()
-}
-
-/// The report of one pass over the step of a program.
-pub struct Ran {
-    /// The name of the pass.
-    pub name: &'static str,
-    /// A description of the pass.
-    pub does: &'static str,
-    /// Operations before and after the pass; for passes of code generation, both are those of the step.
-    pub ops: [usize; 2],
-    /// The effect in words, where the numbers do not show it.
-    pub effect: Option<String>,
-}
-
-/// Runs the passes on the step of a method and calls `ran` after each.
-pub fn each(program: &Program, method: Method, ran: &mut dyn FnMut(Ran)) {
-    let plain = |name, does, before, after| Ran { name, does, ops: [before, after], effect: None };
-    let func = match method {
-        Method::Adaptive => match tiering::of_lanes(program, method) {
-            Some((_, step)) => {
-                ran(plain("rosenbrock", "composes one adaptive step", program.derivatives.ops.len(), step.ops.len()));
-                step
+impl Pass {
+    /// Runs the pass on the graph of a function, if it is one for this form and is not switched off. The loop cannot be
+    /// switched off: without it the code would make a single iteration.
+    pub fn apply(&self, cfg: &mut Cfg, form: Form, context: &Context) -> bool {
+        let off = self.name != "form_loop" && context.options.off.iter().any(|name| name == self.name);
+        let runs = self.on.contains(&form) && !off;
+        if runs {
+            (self.run)(cfg, context);
+            if cfg!(debug_assertions) {
+                verify_cfg(cfg).unwrap_or_else(|fault| panic!("after {}: {fault}\n{cfg}", self.name));
             }
-            None => program.derivatives.clone(),
-        },
-        _ => {
-            let composed = fixed_step::step(program, method);
-            let does = "composes ticks, transitions, the method, outputs and guards into one function";
-            ran(plain("fixed_step", does, program.derivatives.ops.len(), composed.ops.len()));
-            let observe =
-                &mut |pass: &'static opt::Pass, before, after| ran(plain(pass.name, pass.does, before, after));
-            opt::optimise_observed(composed, Context::of(program), observe)
         }
-    };
-    let expanded = math::expand(&func);
-    let does = "expands elementary functions into arithmetic";
-    ran(plain("expand", does, func.ops.len(), expanded.ops.len()));
-    let expanded = if method == Method::Adaptive { numerics::rosenbrock::pooled(&expanded) } else { expanded };
-    for pass in &LATE {
-        let effect = Some(pass.effect(&expanded, &program.description.layout));
-        ran(Ran { name: pass.name, does: pass.does, ops: [expanded.ops.len(); 2], effect });
+        runs
     }
+}
+
+/// Runs all passes on a function.
+pub fn run(func: &Func, form: Form, called: Entry, context: &Context) -> Cfg {
+    let mut cfg = Cfg::straight(func, called);
+    for pass in &LATE {
+        let runs = pass.apply(&mut cfg, form, context);
+        // A step that is not distributed has its code already.
+        if runs && pass.name == "loop_distribution" && cfg.leading.is_none() {
+            break;
+        }
+    }
+    cfg.compact();
+    cfg
 }

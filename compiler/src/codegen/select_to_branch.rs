@@ -1,22 +1,96 @@
 //! Turns selects with expensive arms into branches (reverse if-conversion).
 //!
-//! In: a list of operations in topological order. Out: [`BranchRegions`]: which operations only one arm of a select
-//! needs, so that generated code computes only the arm that is taken. It knows nothing of processors.
+//! In: blocks. Out: a block that computes a select with an expensive arm becomes a branch, a block for each arm, with the
+//! operations that only this arm needs, and a block of which the select is a parameter. The straight pieces of an
+//! outlined function compute both arms, because each of their branches would be one of very many. It knows nothing of
+//! processors.
 //!
 //! Source: Warter, Mahlke, Hwu, Rau, *Reverse If-Conversion*, PLDI 1993.
 
+use crate::ir::cfg::{Block, BlockId, Cfg, Part, Run, Target, Terminator};
 use crate::ir::{Op, Value};
 use std::collections::{HashMap, HashSet};
 
+/// Turns selects of all blocks into branches.
+pub fn select_to_branch(cfg: &mut Cfg) {
+    let mut straight: HashSet<BlockId> = HashSet::new();
+    for piece in &cfg.pieces {
+        let order = cfg.order(*piece);
+        if cfg.head(&order).is_none() {
+            straight.extend(order);
+        }
+    }
+    for (id, live_out) in cfg.live_out().into_iter().enumerate() {
+        let id = BlockId(id as u32);
+        if straight.contains(&id) {
+            continue;
+        }
+        let block = &mut cfg.blocks[id.index()];
+        let runs = Run::all(std::mem::take(&mut block.insts));
+        let (part, end) = (block.part, std::mem::replace(&mut block.end, Terminator::Return(None)));
+        // What is read after each run, from the end of the block.
+        let mut read: HashSet<Value> = live_out.into_iter().chain(cfg.end_uses(&end)).collect();
+        let mut outputs: Vec<Vec<Value>> = Vec::new();
+        for run in runs.iter().rev() {
+            read.extend(run.effect.iter().flat_map(|inst| cfg.uses(inst)));
+            outputs.push(run.list.iter().copied().filter(|value| read.contains(value)).collect());
+            read.extend(run.list.iter().flat_map(|value| cfg.uses(&run.inst(*value))));
+        }
+        let mut at = id;
+        for (run, outputs) in runs.into_iter().zip(outputs.into_iter().rev()) {
+            let regions = BranchRegions::of(|value| run.op(&cfg.ops, value), &run.list, &outputs);
+            at = write(cfg, (&run, &regions, 0), part, at);
+            cfg.blocks[at.index()].insts.extend(run.effect);
+        }
+        cfg.blocks[at.index()].end = end;
+    }
+}
+
+/// Writes the operations of one region at the end of a block; region 0 holds those that run unconditionally. Returns the
+/// block in which they end.
+fn write(cfg: &mut Cfg, (run, regions, number): (&Run, &BranchRegions, usize), part: Part, mut at: BlockId) -> BlockId {
+    let mut done = 0;
+    for value in &regions.members[number] {
+        // Selects that were written together with an earlier one.
+        if done > 0 {
+            done -= 1;
+            continue;
+        }
+        let Some(arms) = regions.arms.get(value) else {
+            cfg.blocks[at.index()].insts.push(run.inst(*value));
+            continue;
+        };
+        let choices = regions.merged.get(value).map_or(std::slice::from_ref(value), |choices| choices);
+        done = choices.len() - 1;
+        let select = |cfg: &Cfg, choice: Value| match cfg.op(choice) {
+            Op::Select(when, yes, no) => (when, [yes, no]),
+            op => unreachable!("{op} is no select"),
+        };
+        let params = choices.to_vec();
+        let after = cfg.block(Block { part, params, insts: Vec::new(), end: Terminator::Return(None) });
+        let when = select(cfg, *value).0;
+        let [yes, no] = [0, 1].map(|which| {
+            let arm = cfg.empty(part);
+            let last = write(cfg, (run, regions, arms[which]), part, arm);
+            let args = choices.iter().map(|choice| select(cfg, *choice).1[which]).collect();
+            cfg.blocks[last.index()].end = Terminator::Jump(Target { block: after, args });
+            arm.into()
+        });
+        cfg.blocks[at.index()].end = Terminator::Branch { when, yes, no };
+        at = after;
+    }
+    at
+}
+
 /// Regions of a list of operations: each arm of a select that becomes a branch is a region, with the operations that
 /// only this arm needs. A select with cheap arms stays one operation, which costs less than a mispredicted branch.
-pub struct BranchRegions {
+struct BranchRegions {
     /// The operations of each region, in order; region 0 holds those that run unconditionally.
-    pub members: Vec<Vec<Value>>,
+    members: Vec<Vec<Value>>,
     /// The regions of the true and the false arm of a select that becomes a branch.
-    pub arms: HashMap<Value, [usize; 2]>,
+    arms: HashMap<Value, [usize; 2]>,
     /// Adjacent selects on the same condition share one branch: by the first of them, all of them.
-    pub merged: HashMap<Value, Vec<Value>>,
+    merged: HashMap<Value, Vec<Value>>,
 }
 
 /// Minimum cost of an expensive arm, as [`Op::effort`].
@@ -26,8 +100,7 @@ const MAX_DEPTH: usize = 24;
 
 impl BranchRegions {
     /// The regions of a list of operations, of which `outputs` are read elsewhere.
-    pub fn of(ops: &[Op], list: &[Value], outputs: &[Value]) -> BranchRegions {
-        let op = |value: Value| ops[value.index()];
+    fn of(op: impl Fn(Value) -> Op, list: &[Value], outputs: &[Value]) -> BranchRegions {
         // A region belongs to one arm of a select; region 0 to none.
         struct Region {
             select: Value,
@@ -51,7 +124,7 @@ impl BranchRegions {
                 *region = Some(0);
             }
         }
-        let (merged, mut followers) = (merged(ops, list), HashSet::new());
+        let (merged, mut followers) = (merged(&op, list), HashSet::new());
         followers.extend(merged.values().flat_map(|selects| &selects[1..]).copied());
         for value in list.iter().rev() {
             if followers.contains(value) {
@@ -135,12 +208,12 @@ impl BranchRegions {
 }
 
 /// Runs of adjacent selects on the same condition, none of which reads another of its run: by the first of the run.
-fn merged(ops: &[Op], list: &[Value]) -> HashMap<Value, Vec<Value>> {
+fn merged(op: impl Fn(Value) -> Op, list: &[Value]) -> HashMap<Value, Vec<Value>> {
     let mut merged: HashMap<Value, Vec<Value>> = HashMap::new();
     let mut run: Vec<Value> = Vec::new();
     let mut condition = None;
     for value in list {
-        let now = match ops[value.index()] {
+        let now = match op(*value) {
             Op::Select(when, yes, no) if when != yes && when != no => {
                 let is_independent = ![yes, no].iter().any(|arm| run.contains(arm));
                 (is_independent || run.is_empty()).then_some(when)

@@ -1,17 +1,28 @@
 //! Sinking: moves cheap operations down to their first use, to shorten live ranges.
 //!
-//! In: a list of operations in topological order. Out: the same operations in another topological order. An operation
-//! is sunk if it depends on loads only and costs no more than an addition; it then occupies no register until its first
-//! use. It knows nothing of processors.
+//! In: blocks. Out: the same blocks, with their operations in another topological order. An operation is sunk if it
+//! depends on loads only and costs no more than an addition; it then occupies no register until its first use. No
+//! operation crosses a store. It knows nothing of processors.
 //!
 //! Compare LLVM's `Sink` pass; Knoop, Rüthing, Steffen, *Partial Dead Code Elimination*, PLDI 1994.
 
+use crate::ir::cfg::{Cfg, Part, Run};
 use crate::ir::{Op, Value};
 use std::collections::HashMap;
 
+/// Sinks cheap operations in all blocks that are not cold.
+pub fn sink(cfg: &mut Cfg) {
+    for block in cfg.blocks.iter_mut().filter(|block| block.part != Part::Cold) {
+        for run in Run::all(std::mem::take(&mut block.insts)) {
+            let sunk = sunk(|value| run.op(&cfg.ops, value), &run.list);
+            block.insts.extend(sunk.into_iter().map(|value| run.inst(value)));
+            block.insts.extend(run.effect);
+        }
+    }
+}
+
 /// The list, with cheap operations sunk to their first use.
-pub fn sink(ops: &[Op], list: &[Value]) -> Vec<Value> {
-    let op = |value: Value| ops[value.index()];
+fn sunk(op: impl Fn(Value) -> Op, list: &[Value]) -> Vec<Value> {
     let position: HashMap<Value, usize> = list.iter().enumerate().map(|(at, value)| (*value, at)).collect();
     let mut sinkable = vec![false; list.len()];
     for (at, value) in list.iter().enumerate() {
@@ -65,13 +76,13 @@ mod tests {
         let product = build.mul(first_use, second);
         let result = build.fma(product, product, sum);
         let list: Vec<Value> = (0..build.ops().len() as u32).map(Value).collect();
-        let ordered = sink(build.ops(), &list);
+        let ordered = sunk(|value| build.get(value), &list);
         assert_eq!(ordered, [x, y, z, sum, less, first_use, second, product, result]);
         let w = build.load(Slot(6));
         let more = build.add(w, w);
         let last = build.mul(result, more);
         let list = [w, more, x, y, z, sum, less, first_use, second, product, result, last];
-        let ordered = sink(build.ops(), &list);
+        let ordered = sunk(|value| build.get(value), &list);
         assert_eq!(ordered, [x, y, z, sum, less, first_use, second, product, result, w, more, last]);
     }
 }

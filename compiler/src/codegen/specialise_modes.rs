@@ -1,14 +1,24 @@
 //! Specialises a step by the modes of its automata: for each mode, the residual operations.
 //!
-//! In: a verified, expanded function. Out: [`Specialised`]: the function with residual operations appended, and a
-//! multi-way branch for each automaton. An automaton is a slot that the function only selects and compares with
-//! constants, its modes. Operations that depend on several automata, and operations that depend on none and are needed
-//! in more than one place, stay common to all modes. It knows nothing of processors.
+//! In: a step in one block. Out: a switch on the mode of each automaton, with a block of residual operations for each
+//! mode. An automaton is a slot that the step only selects and compares with constants, its modes. Operations that
+//! depend on several automata, and operations that depend on none and are needed in more than one place, stay common to
+//! all modes. It knows nothing of processors.
+//!
+//! ```text
+//! common operations; switch on mode 1
+//!   each mode: its residual operations; stores what only this automaton changes
+//! what depends on automaton 1 and no later one; switch on mode 2
+//!   …
+//! guards, which read stored values back; the status
+//! ```
 //!
 //! Method: polyvariant specialisation, Jones, Gomard, Sestoft, *Partial Evaluation and Automatic Program Generation*,
 //! 1993.
 
+use crate::codegen::side_exit::{cold, tested};
 use crate::ir::build::Build;
+use crate::ir::cfg::{Block, BlockId, Cfg, Inst, Part, Place, Target, Terminator};
 use crate::ir::partial_eval::{known, partial_eval, slice};
 use crate::ir::{Func, Op, Type, Value, number_asked};
 use abi::Slot;
@@ -16,20 +26,20 @@ use std::cmp::Reverse;
 use std::collections::{BTreeMap, HashMap, HashSet};
 
 /// A function with its operations grouped by automaton and mode.
-pub struct Specialised {
+struct Specialised {
     /// The function; the residual operations of single modes follow its own operations.
-    pub func: Func,
+    func: Func,
     /// Operations that depend on no automaton, in topological order.
-    pub common: Vec<Value>,
+    common: Vec<Value>,
     /// The automata, each with the operations that depend on it alone.
-    pub automata: Vec<Automaton>,
+    automata: Vec<Automaton>,
     /// Operations that depend on several automata, or on one that is too small to specialise; in topological order.
-    pub joint: Vec<Value>,
+    joint: Vec<Value>,
 }
 
 impl Specialised {
     /// For each value that depends on automata, the index of the last automaton that it needs.
-    pub fn stages(&self) -> HashMap<Value, usize> {
+    fn stages(&self) -> HashMap<Value, usize> {
         let mut stages = HashMap::new();
         for (k, automaton) in self.automata.iter().enumerate() {
             stages.extend(automaton.outputs.iter().map(|output| (*output, k)));
@@ -44,7 +54,7 @@ impl Specialised {
 
     /// Everything read after automaton `number`: by those `joint` operations for which `by` holds, by writes to rings,
     /// and by later automata.
-    pub fn read_after(&self, number: usize, by: impl Fn(Value) -> bool) -> Read {
+    fn read_after(&self, number: usize, by: impl Fn(Value) -> bool) -> Read {
         let mut read = Read::default();
         for value in self.joint.iter().filter(|value| by(**value)) {
             read.operation(self.func.op(*value));
@@ -56,9 +66,9 @@ impl Specialised {
             cases.for_each(|case| {
                 case.each(&mut |case| {
                     case.list.iter().for_each(|value| read.operation(self.func.op(*value)));
-                    match &case.terminator {
-                        Terminator::Outputs(outputs) => read.values.extend(outputs),
-                        Terminator::Branch(when, _) => _ = read.values.insert(*when),
+                    match &case.end {
+                        CaseEnd::Outputs(outputs) => read.values.extend(outputs),
+                        CaseEnd::Branch(when, _) => _ = read.values.insert(*when),
                     }
                 });
             });
@@ -69,11 +79,11 @@ impl Specialised {
 
 /// A set of slots and values that are read.
 #[derive(Default)]
-pub struct Read {
+struct Read {
     /// Slots of the block.
-    pub slots: HashSet<Slot>,
+    slots: HashSet<Slot>,
     /// Values read as operands.
-    pub values: HashSet<Value>,
+    values: HashSet<Value>,
 }
 
 impl Read {
@@ -86,27 +96,27 @@ impl Read {
 }
 
 /// The operations that depend on the mode in one slot.
-pub struct Automaton {
+struct Automaton {
     /// The slot that holds the mode.
-    pub slot: Slot,
+    slot: Slot,
     /// Its values that other operations or results read.
-    pub outputs: Vec<Value>,
+    outputs: Vec<Value>,
     /// For each mode, the bits of its number and its residual operations.
-    pub cases: Vec<(u64, Case)>,
+    cases: Vec<(u64, Case)>,
     /// The operations for any other number in the slot, not specialised.
-    pub general: Case,
+    general: Case,
 }
 
 /// Residual operations for one mode and how they end.
-pub struct Case {
+struct Case {
     /// Operations in topological order.
-    pub list: Vec<Value>,
+    list: Vec<Value>,
     /// How the case ends.
-    pub terminator: Terminator,
+    end: CaseEnd,
 }
 
 /// The end of a case.
-pub enum Terminator {
+enum CaseEnd {
     /// The value of each output of the automaton.
     Outputs(Vec<Value>),
     /// A branch on a boolean that many operations depend on: the case where it is true, and the case where it is false.
@@ -115,9 +125,9 @@ pub enum Terminator {
 
 impl Case {
     /// Visits the case and all nested cases.
-    pub fn each(&self, each: &mut impl FnMut(&Case)) {
+    fn each(&self, each: &mut impl FnMut(&Case)) {
         each(self);
-        if let Terminator::Branch(_, sides) = &self.terminator {
+        if let CaseEnd::Branch(_, sides) = &self.end {
             sides.iter().for_each(|side| side.each(each));
         }
     }
@@ -134,9 +144,9 @@ const MAX_SPLIT_OPS: usize = 200;
 /// Maximum depth of nested branches in a case.
 const MAX_DEPTH: usize = 4;
 
-/// Where an operation is computed.
+/// The group of operations with which an operation is computed.
 #[derive(Clone, Copy, PartialEq, Eq)]
-enum Place {
+enum Group {
     Common,
     Within(usize),
     Joint,
@@ -146,70 +156,279 @@ enum Place {
     Cold,
 }
 
-/// The modes of each automaton, by slot: the bits of the constants that the slot is compared with.
-pub type Modes = HashMap<Slot, Vec<u64>>;
+/// The modes of each slot: the bits of the constants that the slot is compared with.
+type Modes = HashMap<Slot, Vec<u64>>;
 
-/// The modes of all automata of a function.
-pub fn modes(func: &Func) -> Modes {
-    let of_load = |(load, modes)| match func.op(load) {
-        Op::Load(slot) => (slot, modes),
-        _ => unreachable!("it is a load"),
-    };
-    automata(func, &Modes::new()).into_iter().map(of_load).collect()
+/// Specialises all blocks that hold a step.
+pub fn specialise_modes(cfg: &mut Cfg) {
+    // The copies that unswitching makes may no longer compare a slot with all of its modes.
+    let mut modes = Modes::new();
+    for (_, slot, bits) in cfg.ops.iter().filter_map(|op| number_asked(*op, |value| cfg.op(value))) {
+        let of_slot = modes.entry(slot).or_default();
+        if !of_slot.contains(&bits) {
+            of_slot.push(bits);
+        }
+    }
+    for id in 0..cfg.blocks.len() as u32 {
+        let is_body = cfg.blocks[id as usize].part == Part::Body;
+        if let Some(func) = cfg.straight_line(BlockId(id)).filter(|_| is_body) {
+            let cold = cold(&func);
+            let specialised = specialise(&func, &modes, &cold, tested(&func).0);
+            if !specialised.automata.is_empty() {
+                let to = cfg.append(&specialised.func.ops);
+                let to = &to;
+                Writer { cfg, to, specialised: &specialised, at: BlockId(id), stored: HashMap::new() }.step(&cold);
+            }
+        }
+    }
+}
+
+/// Writes a specialised step into blocks.
+struct Writer<'a> {
+    cfg: &'a mut Cfg,
+    /// The value of the graph for a value of the specialised function.
+    to: &'a dyn Fn(Value) -> Value,
+    specialised: &'a Specialised,
+    /// The block that is being written.
+    at: BlockId,
+    /// Values that modes have stored and that are read back at each use.
+    stored: HashMap<Value, Slot>,
+}
+
+/// Where all cases of an automaton join.
+struct Join {
+    block: BlockId,
+    /// For each output of the automaton, whether the code after the join reads it.
+    outputs: Vec<bool>,
+    /// Slots that each case stores, with the index of the stored output.
+    stores: Vec<(Slot, usize)>,
+    /// The slot of the automaton and the bits it holds in this case, where they are known.
+    held: Option<(Slot, u64)>,
+}
+
+impl Writer<'_> {
+    fn push(&mut self, inst: Inst) {
+        self.cfg.blocks[self.at.index()].insts.push(inst);
+    }
+
+    /// Computes operations in order.
+    fn compute(&mut self, list: &[Value]) {
+        let func = &self.specialised.func;
+        for value in list {
+            for read in func.reads(func.op(*value)) {
+                if let Some(slot) = self.stored.get(&read) {
+                    self.push(Inst::Reload((self.to)(read), Place::slot(*slot)));
+                }
+            }
+            let value = (self.to)(*value);
+            if !self.cfg.is_free(value) {
+                self.push(Inst::Compute(value));
+            }
+        }
+    }
+
+    fn store(&mut self, stores: &[(Slot, Value)]) {
+        for (slot, value) in stores {
+            self.push(Inst::Store(Place::slot(*slot), (self.to)(*value)));
+        }
+    }
+
+    /// Writes the whole step. `cold`: the operations that only the status of a failed guard needs.
+    fn step(mut self, cold: &[bool]) {
+        let Specialised { func, common, automata, joint } = self.specialised;
+        let is_common: HashSet<Value> = common.iter().copied().collect();
+        self.cfg.blocks[self.at.index()].insts.clear();
+        self.compute(common);
+        // Values that are already computed are stored here, so that they occupy no register, unless their slot is still
+        // to be read.
+        let later = func.ops.iter().enumerate().filter(|(i, _)| !is_common.contains(&Value(*i as u32)));
+        let loads = later.filter_map(|(_, op)| if let Op::Load(slot) = op { Some(*slot) } else { None });
+        let read_later: HashSet<Slot> = loads.chain(automata.iter().map(|automaton| automaton.slot)).collect();
+        let (early, mut last): (Vec<_>, Vec<_>) =
+            func.stores.iter().partition(|(slot, value)| is_common.contains(value) && !read_later.contains(slot));
+        self.store(&early);
+        // The same after each automaton. Operations that depend on several automata follow the last of these.
+        let stages = self.specialised.stages();
+        let stored: HashSet<Value> = func.stores.iter().map(|(_, value)| *value).collect();
+        let cold: Vec<Value> = (0..cold.len()).filter(|i| cold[*i]).map(|i| Value(i as u32)).collect();
+        let mut cold_operands: Vec<Value> = Vec::new();
+        for value in &cold {
+            func.op(*value).each_operand(|operand| cold_operands.push(operand));
+        }
+        let of_stage = |stage: Option<&usize>| -> Vec<Value> {
+            joint.iter().copied().filter(|value| stages.get(value) == stage).collect()
+        };
+        self.compute(&of_stage(None));
+        let written = func.writes.iter().flat_map(|write| [write.index, write.value]);
+        let not_only_guard = func.live_for(stored.iter().copied().chain(written));
+        for (k, automaton) in automata.iter().enumerate() {
+            let read = self.specialised.read_after(k, |value| not_only_guard[value.index()]);
+            let mut values = read.values;
+            // Each mode itself stores the states that only its automaton changes; guards read them back from the block.
+            let (own, others): (Vec<_>, Vec<_>) =
+                last.iter().partition(|(slot, value)| automaton.outputs.contains(value) && !read.slots.contains(slot));
+            let reloaded = own.iter().filter(|(_, value)| !values.contains(value)).map(|(slot, value)| (*value, *slot));
+            self.stored.extend(reloaded);
+            let guards = joint.iter().filter(|value| !not_only_guard[value.index()]);
+            let guard_operands = guards.flat_map(|value| func.reads(func.op(*value)));
+            values.extend(guard_operands.filter(|value| !self.stored.contains_key(value)));
+            values.extend(others.iter().map(|(_, value)| *value).chain(tested(func).0));
+            values.extend(cold_operands.iter().filter(|operand| !stored.contains(operand)));
+            self.automaton(automaton, &own, &values);
+            self.compute(&of_stage(Some(&k)));
+            let is_available = |value: &Value| stages.get(value).is_none_or(|stage| *stage <= k);
+            let (now, later): (Vec<_>, Vec<_>) =
+                others.iter().partition(|(slot, value)| is_available(value) && !read.slots.contains(slot));
+            self.store(&now);
+            last = later;
+        }
+        func.writes.iter().for_each(|write| self.push(Inst::Write(write.map(self.to))));
+        self.store(&last);
+        // Only the cold operations read these.
+        for (slot, value) in func.stores.iter().filter(|(_, value)| cold_operands.contains(value)) {
+            if !matches!(func.op(*value), Op::Load(_)) {
+                self.push(Inst::Reload((self.to)(*value), Place::slot(*slot)));
+                self.stored.remove(value);
+            }
+        }
+        self.compute(&cold);
+        self.cfg.blocks[self.at.index()].end = Terminator::Return(func.status.map(self.to));
+    }
+
+    /// Writes the switch on the mode of an automaton and its cases; goes on at their join. The automaton's own `stores`
+    /// are in each case; outputs among `read` become parameters of the join.
+    fn automaton(&mut self, automaton: &Automaton, stores: &[(Slot, Value)], read: &HashSet<Value>) {
+        let params = automaton.outputs.iter().filter(|output| read.contains(output));
+        let params = params.map(|output| (self.to)(*output)).collect();
+        let part = Part::Body;
+        let end = Terminator::Return(None);
+        let after = self.cfg.block(Block { part, params, insts: Vec::new(), end });
+        let number = |value: &Value| automaton.outputs.iter().position(|output| output == value).expect("its own");
+        let join = |held: Option<u64>| Join {
+            block: after,
+            outputs: automaton.outputs.iter().map(|output| read.contains(output)).collect(),
+            stores: stores.iter().map(|(slot, value)| (*slot, number(value))).collect(),
+            held: held.map(|bits| (automaton.slot, bits)),
+        };
+        // A mode that is left in the same step is rarely active, so it is tested last.
+        let mut cases: Vec<(u64, &Case)> = automaton.cases.iter().map(|(bits, case)| (*bits, case)).collect();
+        cases.sort_by_key(|(bits, case)| self.changes(case, &join(Some(*bits))));
+        let from = self.at;
+        let mut blocks = Vec::new();
+        for (bits, case) in cases {
+            let join = join(Some(bits));
+            blocks.push((bits, self.side(case, &join)));
+        }
+        let default = self.cfg.empty(Part::Cold);
+        self.case(&automaton.general, default, &join(None));
+        self.cfg.blocks[from.index()].end = Terminator::Switch { slot: automaton.slot, cases: blocks, default };
+        self.at = after;
+    }
+
+    /// Whether a case without further branches ends with another mode than the one it began with.
+    fn changes(&self, case: &Case, join: &Join) -> bool {
+        let CaseEnd::Outputs(outputs) = &case.end else { return false };
+        join.stores.iter().any(|(slot, number)| {
+            let held = join.held.filter(|(held, _)| held == slot);
+            let next = self.specialised.func.op(outputs[*number]);
+            matches!((held, next), (Some((_, bits)), Op::Real(next)) if next != bits)
+        })
+    }
+
+    /// Writes a case into a new block, a cold one if it changes the mode.
+    fn side(&mut self, case: &Case, join: &Join) -> BlockId {
+        let part = if self.changes(case, join) { Part::Cold } else { Part::Body };
+        let block = self.cfg.empty(part);
+        self.case(case, block, join);
+        block
+    }
+
+    /// Writes one case and the jump to the join.
+    fn case(&mut self, case: &Case, block: BlockId, join: &Join) {
+        self.at = block;
+        // A case computes the values of its automaton itself; they are not stored yet.
+        let stored = std::mem::take(&mut self.stored);
+        let func = &self.specialised.func;
+        let end = match &case.end {
+            CaseEnd::Outputs(outputs) => {
+                let is_available = |(slot, value): &(Slot, Value)| match func.op(*value) {
+                    Op::Load(from) => from == *slot,
+                    Op::Real(bits) => join.held == Some((*slot, bits)),
+                    _ => false,
+                };
+                let stores = join.stores.iter().map(|(slot, number)| (*slot, outputs[*number]));
+                let stores: Vec<(Slot, Value)> = stores.filter(|store| !is_available(store)).collect();
+                let read: Vec<Value> =
+                    outputs.iter().zip(&join.outputs).filter(|(_, read)| **read).map(|(output, _)| *output).collect();
+                let live = func.live_for(stores.iter().map(|(_, value)| *value).chain(read.iter().copied()));
+                let list: Vec<Value> = case.list.iter().copied().filter(|value| live[value.index()]).collect();
+                self.compute(&list);
+                self.store(&stores);
+                Terminator::Jump(Target { block: join.block, args: read.into_iter().map(self.to).collect() })
+            }
+            CaseEnd::Branch(when, sides) => {
+                self.compute(&case.list);
+                let [yes, no] = sides.each_ref().map(|side| self.side(side, join));
+                Terminator::Branch { when: (self.to)(*when), yes: yes.into(), no: no.into() }
+            }
+        };
+        self.cfg.blocks[block.index()].end = end;
+        self.stored = stored;
+    }
 }
 
 /// Specialises a function.
 ///
 /// `modes`: the modes of the function before unswitching, since a copy may no longer compare a slot with all of them.
 /// `cold`: operations to leave out. `guard`: the boolean that ends the step.
-pub fn specialise(func: &Func, modes: &Modes, cold: &[bool], guard: Option<Value>) -> Specialised {
+fn specialise(func: &Func, modes: &Modes, cold: &[bool], guard: Option<Value>) -> Specialised {
     let all = || (0..func.ops.len()).map(|i| Value(i as u32));
     let slots = automata(func, modes);
     let mut places = dependences(func, cold, &slots);
     move_guards_after(func, guard, &mut places);
     for k in 0..slots.len() {
-        let members = places.iter().filter(|place| **place == Place::Within(k)).count();
+        let members = places.iter().filter(|place| **place == Group::Within(k)).count();
         if members < MIN_OPS {
-            places.iter_mut().filter(|place| **place == Place::Within(k)).for_each(|place| *place = Place::Joint);
+            places.iter_mut().filter(|place| **place == Group::Within(k)).for_each(|place| *place = Group::Joint);
         }
     }
     // An operation that depends on no mode but is needed by one automaton only is computed there.
-    let mut users: Vec<Option<Place>> = vec![None; func.ops.len()];
-    let used = |value: Value, by: Place, users: &mut Vec<Option<Place>>| {
+    let mut users: Vec<Option<Group>> = vec![None; func.ops.len()];
+    let used = |value: Value, by: Group, users: &mut Vec<Option<Group>>| {
         let known = &mut users[value.index()];
-        *known = Some(known.map_or(by, |known| if known == by { known } else { Place::Common }));
+        *known = Some(known.map_or(by, |known| if known == by { known } else { Group::Common }));
     };
-    func.results().for_each(|value| used(value, Place::Common, &mut users));
+    func.results().for_each(|value| used(value, Group::Common, &mut users));
     for value in all().rev() {
         let i = value.index();
-        if let (Place::Common, Some(Place::Within(k))) = (places[i], users[i])
+        if let (Group::Common, Some(Group::Within(k))) = (places[i], users[i])
             && !func.ops[i].is_constant()
         {
-            places[i] = Place::Within(k);
+            places[i] = Group::Within(k);
         }
         let by = places[i];
         func.ops[i].each_operand(|operand| used(operand, by, &mut users));
     }
     rematerialise_cheap(func, &mut places);
     let mut wanted: Vec<HashSet<Value>> = vec![HashSet::new(); slots.len()];
-    let mut note = |value: Value, by: Place| {
-        if let Place::Within(k) = places[value.index()]
-            && by != Place::Within(k)
+    let mut note = |value: Value, by: Group| {
+        if let Group::Within(k) = places[value.index()]
+            && by != Group::Within(k)
         {
             wanted[k].insert(value);
         }
     };
-    func.results().for_each(|value| note(value, Place::Common));
+    func.results().for_each(|value| note(value, Group::Common));
     for value in all() {
         func.op(value).each_operand(|operand| note(operand, places[value.index()]));
     }
-    let listed = |place: Place| -> Vec<Value> { all().filter(|value| places[value.index()] == place).collect() };
+    let listed = |place: Group| -> Vec<Value> { all().filter(|value| places[value.index()] == place).collect() };
     let mut build = Build::of(func);
-    let mut available: HashSet<Value> = listed(Place::Common).into_iter().collect();
+    let mut available: HashSet<Value> = listed(Group::Common).into_iter().collect();
     let automata = slots.iter().zip(wanted).enumerate().filter(|(_, (_, wanted))| !wanted.is_empty());
     let automata = automata
         .map(|(k, ((load, modes), wanted))| {
-            let members = listed(Place::Within(k));
+            let members = listed(Group::Within(k));
             let mut outputs: Vec<Value> = wanted.into_iter().collect();
             outputs.sort_unstable();
             let Op::Load(slot) = func.op(*load) else { unreachable!("it is a load") };
@@ -218,17 +437,16 @@ pub fn specialise(func: &Func, modes: &Modes, cold: &[bool], guard: Option<Value
             let case =
                 |bits: &u64| (*bits, case(&mut build, &mut available, (*load, *bits), &members, (&outputs, next)));
             let cases = modes.iter().map(case).collect();
-            let general =
-                Case { list: slice(&build, &available, &outputs), terminator: Terminator::Outputs(outputs.clone()) };
+            let general = Case { list: slice(&build, &available, &outputs), end: CaseEnd::Outputs(outputs.clone()) };
             Automaton { slot, outputs, cases, general }
         })
         .collect();
     let ops = build.into_ops();
     Specialised {
         func: Func { ops, ..func.clone() },
-        common: listed(Place::Common),
+        common: listed(Group::Common),
         automata,
-        joint: listed(Place::Joint),
+        joint: listed(Group::Joint),
     }
 }
 
@@ -237,7 +455,7 @@ pub fn shared_operands(func: &Func, wanted: impl Fn(Op) -> bool) -> Vec<(Value, 
     let places = dependences(func, &vec![false; func.ops.len()], &automata(func, &Modes::new()));
     let mut readers: BTreeMap<Value, HashSet<usize>> = BTreeMap::new();
     for (op, place) in func.ops.iter().zip(places) {
-        let Place::Within(k) = place else { continue };
+        let Group::Within(k) = place else { continue };
         op.each_operand(|operand| {
             if wanted(func.op(operand)) {
                 readers.entry(operand).or_default().insert(k);
@@ -277,31 +495,31 @@ fn automata(func: &Func, known: &Modes) -> Vec<(Value, Vec<u64>)> {
 }
 
 /// For each operation, whether it depends on no automaton, on one or on several.
-fn dependences(func: &Func, cold: &[bool], automata: &[(Value, Vec<u64>)]) -> Vec<Place> {
+fn dependences(func: &Func, cold: &[bool], automata: &[(Value, Vec<u64>)]) -> Vec<Group> {
     let number: HashMap<Value, usize> = automata.iter().enumerate().map(|(k, (load, _))| (*load, k)).collect();
-    let mut of: Vec<Place> = Vec::with_capacity(func.ops.len());
+    let mut of: Vec<Group> = Vec::with_capacity(func.ops.len());
     for op in &func.ops {
-        let mut place = Place::Common;
+        let mut place = Group::Common;
         op.each_operand(|operand| {
-            let of = number.get(&operand).map_or(of[operand.index()], |k| Place::Within(*k));
+            let of = number.get(&operand).map_or(of[operand.index()], |k| Group::Within(*k));
             place = match (place, of) {
-                (Place::Common, of) => of,
-                (place, Place::Common) => place,
+                (Group::Common, of) => of,
+                (place, Group::Common) => place,
                 (place, of) if place == of => place,
-                _ => Place::Joint,
+                _ => Group::Joint,
             };
         });
         of.push(place);
     }
     for (place, _) in of.iter_mut().zip(cold).filter(|(_, cold)| **cold) {
-        *place = Place::Cold;
+        *place = Group::Cold;
     }
     of
 }
 
 /// Rematerialises cheap operations whose results only modes read, in each of these modes: loads of slots that are not
 /// stored, and changes of sign.
-fn rematerialise_cheap(func: &Func, places: &mut [Place]) {
+fn rematerialise_cheap(func: &Func, places: &mut [Group]) {
     let mut needed_elsewhere = vec![false; func.ops.len()];
     func.results().for_each(|value| needed_elsewhere[value.index()] = true);
     for (i, op) in func.ops.iter().enumerate().rev() {
@@ -309,10 +527,10 @@ fn rematerialise_cheap(func: &Func, places: &mut [Place]) {
             Op::Load(slot) => func.stores.iter().all(|(stored, _)| stored != slot),
             op => matches!(op, Op::Neg(_) | Op::Abs(_)),
         };
-        if places[i] == Place::Common && !needed_elsewhere[i] && is_cheap {
-            places[i] = Place::Rematerialised;
+        if places[i] == Group::Common && !needed_elsewhere[i] && is_cheap {
+            places[i] = Group::Rematerialised;
         }
-        if !matches!(places[i], Place::Within(_) | Place::Rematerialised) {
+        if !matches!(places[i], Group::Within(_) | Group::Rematerialised) {
             op.each_operand(|operand| needed_elsewhere[operand.index()] = true);
         }
     }
@@ -320,7 +538,7 @@ fn rematerialise_cheap(func: &Func, places: &mut [Place]) {
 
 /// Moves operations that only guards need to the end, after all automata, if stored values are the only mode-dependent
 /// values that they read: they are the same in each mode.
-fn move_guards_after(func: &Func, guard: Option<Value>, places: &mut [Place]) {
+fn move_guards_after(func: &Func, guard: Option<Value>, places: &mut [Group]) {
     let mut stored = vec![false; func.ops.len()];
     func.stores.iter().for_each(|(_, value)| stored[value.index()] = true);
     let mut needed = stored.clone();
@@ -330,7 +548,7 @@ fn move_guards_after(func: &Func, guard: Option<Value>, places: &mut [Place]) {
     if let Some(status) = func.status.filter(|_| guard.is_none()) {
         needed[status.index()] = true;
     }
-    for i in (0..func.ops.len()).rev().filter(|i| places[*i] != Place::Cold) {
+    for i in (0..func.ops.len()).rev().filter(|i| places[*i] != Group::Cold) {
         if needed[i] {
             func.ops[i].each_operand(|operand| needed[operand.index()] = true);
         }
@@ -339,11 +557,11 @@ fn move_guards_after(func: &Func, guard: Option<Value>, places: &mut [Place]) {
         let (mut same, mut reads_joint) = (true, false);
         op.each_operand(|operand| {
             let operand = operand.index();
-            same &= stored[operand] || !matches!(places[operand], Place::Within(_));
-            reads_joint |= places[operand] == Place::Joint;
+            same &= stored[operand] || !matches!(places[operand], Group::Within(_));
+            reads_joint |= places[operand] == Group::Joint;
         });
-        if matches!(places[i], Place::Within(_)) && (same || reads_joint) {
-            places[i] = Place::Joint;
+        if matches!(places[i], Group::Within(_)) && (same || reads_joint) {
+            places[i] = Group::Joint;
         }
     }
 }
@@ -373,7 +591,7 @@ fn split_case(
 ) -> Case {
     let list = slice(build, available, &outputs);
     if depth == MAX_DEPTH || list.len() > MAX_SPLIT_OPS {
-        return Case { list, terminator: Terminator::Outputs(outputs) };
+        return Case { list, end: CaseEnd::Outputs(outputs) };
     }
     let frequent = most_tested(build, &list).filter(|_| list.len() >= MIN_SPLIT_OPS);
     let changes_mode = next.and_then(|(next, held)| match build.get(outputs[next]) {
@@ -395,14 +613,14 @@ fn split_case(
         };
         let case = (changes_mode == Some(condition) || shorter(build, available)).then(|| {
             let sides = sides.map(|outputs| split_case(build, available, outputs, next, depth + 1));
-            Case { list: first.clone(), terminator: Terminator::Branch(condition, Box::new(sides)) }
+            Case { list: first.clone(), end: CaseEnd::Branch(condition, Box::new(sides)) }
         });
         first.iter().for_each(|value| _ = available.remove(value));
         if let Some(case) = case {
             return case;
         }
     }
-    Case { list, terminator: Terminator::Outputs(outputs) }
+    Case { list, end: CaseEnd::Outputs(outputs) }
 }
 
 /// The boolean that most operations of a list read, if more than one does; the first of several.
@@ -462,9 +680,9 @@ mod tests {
         assert_eq!(cases, [(0.0, names("loa loa loa mul fma les")), (1.0, names("loa loa mul"))]);
         assert_eq!(shown(&automaton.general).iter().filter(|op| *op == "sel").count(), 3);
         // The next mode is branched on, not selected; neither side has any operations left.
-        let Terminator::Branch(_, sides) = &automaton.cases[0].1.terminator else { panic!("it branches") };
-        let next = sides.each_ref().map(|side| match (&side.list[..], &side.terminator) {
-            ([], Terminator::Outputs(outputs)) => outputs.last().map(|output| specialised.func.op(*output)),
+        let CaseEnd::Branch(_, sides) = &automaton.cases[0].1.end else { panic!("it branches") };
+        let next = sides.each_ref().map(|side| match (&side.list[..], &side.end) {
+            ([], CaseEnd::Outputs(outputs)) => outputs.last().map(|output| specialised.func.op(*output)),
             _ => panic!("it ends"),
         });
         assert_eq!(next, [1f64, 0.0].map(|number| Some(Op::Real(number.to_bits()))));
@@ -489,9 +707,7 @@ mod tests {
         build.store(Slot(4), changed);
         let func = build.finish();
         let specialised = specialise(&func, &Modes::new(), &vec![false; func.ops.len()], None);
-        let Terminator::Branch(condition, sides) = &specialised.automata[0].cases[0].1.terminator else {
-            panic!("it branches")
-        };
+        let CaseEnd::Branch(condition, sides) = &specialised.automata[0].cases[0].1.end else { panic!("it branches") };
         assert!(matches!(specialised.func.op(*condition), Op::Less(..)));
         for side in sides.iter() {
             let products = side.list.iter().filter(|value| matches!(specialised.func.op(**value), Op::Mul(..))).count();

@@ -4,15 +4,15 @@
 //! function's own pieces, all relocations resolved. It does not know where the bytes will be placed.
 
 use super::unsupported::Unsupported;
-use crate::codegen::emit::{self, Facts};
+use crate::codegen::emit::Emitter;
 use crate::codegen::emit_f64x2;
-use crate::codegen::emit_outlined;
-use crate::codegen::hoist_params::Hoisted;
-use crate::codegen::outline::{Lengths, outline};
+use crate::codegen::form_loop::is_idempotent;
+use crate::codegen::forms::{Context as Passes, Form, Options};
+use crate::codegen::passes;
 use crate::ir::Func;
-use crate::ir::build::prune;
+use crate::ir::cfg::{BlockId, Cfg, Entry, Inst};
+use abi::Layout;
 use abi::image::{Feature, Target};
-use abi::{Layout, Slot};
 use cranelift_codegen::binemit::Reloc;
 use cranelift_codegen::ir::{self as cranelift, ExternalName};
 use cranelift_codegen::isa::{self, OwnedTargetIsa, TargetIsa};
@@ -26,7 +26,7 @@ pub struct FunctionCompiler<'a> {
     isa: &'a dyn TargetIsa,
     context: Context,
     builder: FunctionBuilderContext,
-    lengths: Lengths,
+    options: Options,
 }
 
 /// Machine code of a function, and its alignment.
@@ -64,13 +64,13 @@ impl<'a> FunctionCompiler<'a> {
             isa: &**isa,
             context: Context::new(),
             builder: FunctionBuilderContext::new(),
-            lengths: Lengths::USUAL,
+            options: Options::default(),
         }
     }
 
-    /// Sets the lengths from which functions are outlined, instead of [`Lengths::USUAL`].
-    pub(super) fn set_lengths(&mut self, lengths: Lengths) {
-        self.lengths = lengths;
+    /// Compiles with other settings than the usual ones.
+    pub(super) fn set_options(&mut self, options: &Options) {
+        self.options = options.clone();
     }
 
     /// Compiles a function; its entry, with the signature of [`abi::table::Entry`], is at offset 0.
@@ -78,36 +78,60 @@ impl<'a> FunctionCompiler<'a> {
     /// # Panics
     /// If the code calls anything except its own pieces: a mistake of `emit`.
     pub fn function(&mut self, func: &Func) -> Result<Bytes, Unsupported> {
-        let single = self.single(func);
-        Ok(self.parts(func, single.as_ref(), true)?.all)
+        let graphs = self.graphs(func, None)?;
+        Ok(self.parts(func, &graphs)?.all)
     }
 
     /// Compiles a step for single iterations whose expressions of parameters and step length are hoisted, see
     /// `hoist_params`. `layout`: that of the blocks. None if single iterations have no code of their own.
     pub fn prepared(&mut self, func: &Func, layout: &Layout) -> Result<Option<PreparedBytes>, Unsupported> {
-        let Some(single) = self.single(func) else { return Ok(None) };
-        let Hoisted { prepare, step } = Hoisted::of(&single, layout);
-        let len = prepare.stores.len();
-        let Parts { all: bytes, loop_offset } = self.parts(func, Some(&step), false)?;
-        let prepare = if len > 0 { Some(self.compile_loop(&prepare, None)?) } else { None };
+        let graphs = self.graphs(func, Some(layout))?;
+        let [single, _] = &graphs[..] else { return Ok(None) };
+        let Parts { all: bytes, loop_offset } = self.parts(func, &graphs)?;
+        let (mut prepare, mut len) = (None, 0);
+        if let Some(entry) = single.prepare {
+            let blocks = single.order(entry);
+            let stores = blocks.iter().flat_map(|block| &single.blocks[block.index()].insts);
+            len = stores.filter(|inst| matches!(inst, Inst::Store(..))).count();
+            prepare = Some(self.entry(func, single, (entry, Entry::Several), 0)?);
+        }
         Ok(Some(PreparedBytes { bytes, loop_offset, prepare, len }))
     }
 
-    /// Compiles the loop over any number of iterations as one Cranelift function, without outlining.
-    fn compile_loop(&mut self, func: &Func, distributed: Option<emit::Distributed>) -> Result<Bytes, Unsupported> {
+    /// Compiles the remaining loop of a distributed step, with the signature of [`abi::ahead::RestEntry`]. It reads values
+    /// that the leading loop has computed, one for each of `lanes` steps.
+    pub fn remaining_loop(&mut self, func: &Func, graph: &Cfg, lanes: usize) -> Result<Bytes, Unsupported> {
+        self.entry(func, graph, (BlockId(0), Entry::Several), lanes)
+    }
+
+    /// Compiles one function of a graph that calls no pieces.
+    fn entry(&mut self, func: &Func, graph: &Cfg, entry: (BlockId, Entry), lanes: usize) -> Result<Bytes, Unsupported> {
         self.context.clear();
-        emit::emit(func, distributed, &mut self.context.func, &mut self.builder, self.isa);
+        Emitter::new(graph, self.isa, lanes).emit(entry, &mut self.context.func, &mut self.builder);
         self.compile_context(func)
     }
 
-    /// Compiles and links all parts of a function: the code of a single iteration (`single`), if there is any, then the
-    /// code of any number of iterations. `checks_count`: the single-iteration entry calls the second part when the
-    /// count is not 1.
-    fn parts(&mut self, func: &Func, single: Option<&Func>, checks_count: bool) -> Result<Parts, Unsupported> {
+    /// The graphs of a function: that of a single iteration, if it has code of its own, and that of any number.
+    fn graphs(&self, func: &Func, layout: Option<&Layout>) -> Result<Vec<Cfg>, Unsupported> {
+        let context = Passes { layout, options: &self.options };
+        let graph = |form, called| passes::run(func, form, called, &context);
+        if func.ops.len() > self.options.lengths.max_function {
+            let long = graph(Form::Long, Entry::Several);
+            return if long.pieces.is_empty() { Err(too_large(func)) } else { Ok(vec![long]) };
+        }
+        if is_idempotent(func) {
+            return Ok(vec![graph(Form::Once, Entry::Several)]);
+        }
+        let called = if layout.is_some() { Entry::Single } else { Entry::SingleOrSeveral };
+        Ok(vec![graph(Form::Single, called), graph(Form::Loop, Entry::Several)])
+    }
+
+    /// Compiles and links all parts of a function, in the order of its graphs and their pieces.
+    fn parts(&mut self, func: &Func, graphs: &[Cfg]) -> Result<Parts, Unsupported> {
         let mut all = Bytes { code: Vec::new(), alignment: 1 };
         let mut begins: Vec<usize> = Vec::new();
         let mut calls: Vec<(usize, Call)> = Vec::new();
-        self.each_part(func, single, checks_count, |_, isa, context| {
+        self.each_part(graphs, |_, isa, context| {
             let compiled =
                 context.compile(isa, &mut Default::default()).map_err(|error| refused(func, &error.inner))?;
             let alignment = compiled.buffer.alignment as usize;
@@ -128,14 +152,7 @@ impl<'a> FunctionCompiler<'a> {
             // The caller is always the first part.
             call.resolve(&mut all.code, at, begins[call.piece + 1]).ok_or_else(|| too_large(func))?;
         }
-        Ok(Parts { all, loop_offset: if single.is_some() { begins[1] } else { 0 } })
-    }
-
-    /// Compiles the remaining loop of a distributed step, with the signature of [`abi::ahead::RestEntry`]. Loads from
-    /// slots at or after `size`, the size of the block, read values that the vectorised loop has computed, one for each
-    /// of `lanes` steps.
-    pub fn remaining_loop(&mut self, func: &Func, size: usize, lanes: usize) -> Result<Bytes, Unsupported> {
-        self.compile_loop(func, Some(emit::Distributed { first: Slot(size as u32), lanes }))
+        Ok(Parts { all, loop_offset: if graphs.len() > 1 { begins[1] } else { 0 } })
     }
 
     /// Compiles a function for lanes of two; also returns how many doubles it uses after the blocks.
@@ -155,8 +172,8 @@ impl<'a> FunctionCompiler<'a> {
 
     /// The Cranelift IR of a function.
     pub fn clif(&mut self, func: &Func) -> Result<String, Unsupported> {
-        let (single, mut text) = (self.single(func), String::new());
-        self.each_part(func, single.as_ref(), true, |what, _, context| {
+        let (graphs, mut text) = (self.graphs(func, None)?, String::new());
+        self.each_part(&graphs, |what, _, context| {
             text += &what;
             text += &context.func.display().to_string();
             Ok(())
@@ -166,8 +183,8 @@ impl<'a> FunctionCompiler<'a> {
 
     /// The assembly of a function, as Cranelift prints it.
     pub fn assembly(&mut self, func: &Func) -> Result<String, Unsupported> {
-        let (single, mut text) = (self.single(func), String::new());
-        self.each_part(func, single.as_ref(), true, |what, isa, context| {
+        let (graphs, mut text) = (self.graphs(func, None)?, String::new());
+        self.each_part(&graphs, |what, isa, context| {
             context.set_disasm(true);
             let compiled = context.compile(isa, &mut Default::default());
             text += &what;
@@ -177,55 +194,32 @@ impl<'a> FunctionCompiler<'a> {
         Ok(text)
     }
 
-    /// The function to compile for a single iteration, if single iterations get code of their own.
-    fn single(&self, func: &Func) -> Option<Func> {
-        (func.ops.len() <= self.lengths.max_function && emit::has_single(func)).then(|| uncounted(func))
-    }
-
-    /// Emits each part of a function as Cranelift IR and passes it to `part`. The parts are the single iteration, if
-    /// there is one, and the loop; or, of an outlined function, the loop and then the pieces in order. The text given
-    /// to `part` is a comment line that names the part, empty if there is only one.
+    /// Emits each part of a function as Cranelift IR and passes it to `part`, with a comment line that names it, empty if
+    /// there is only one.
     fn each_part(
         &mut self,
-        func: &Func,
-        single: Option<&Func>,
-        checks_count: bool,
+        graphs: &[Cfg],
         mut part: impl FnMut(String, &dyn TargetIsa, &mut Context) -> Result<(), Unsupported>,
     ) -> Result<(), Unsupported> {
-        let FunctionCompiler { isa, context, builder, lengths } = self;
-        if func.ops.len() <= lengths.max_function {
-            if let Some(single) = single {
+        let FunctionCompiler { isa, context, builder, .. } = self;
+        for graph in graphs {
+            let mut emitter = Emitter::new(graph, *isa, 0);
+            let entries = graph.entries().filter(|(entry, _)| Some(*entry) != graph.prepare);
+            for (number, (entry, called)) in entries.enumerate() {
+                let what = match called {
+                    Entry::Single | Entry::SingleOrSeveral => title(SINGLE_TITLE),
+                    Entry::Several if graphs.len() > 1 => title("any number of iterations"),
+                    Entry::Several if !graph.pieces.is_empty() => title("the loop around its pieces"),
+                    Entry::Several => String::new(),
+                    Entry::Piece => title(&format!("piece {}", number - 1)),
+                };
                 context.clear();
-                emit::emit_single(single, checks_count, &mut context.func, builder, *isa);
-                part(title(SINGLE_TITLE), *isa, context)?;
+                emitter.emit((entry, called), &mut context.func, builder);
+                part(what, *isa, context)?;
             }
-            let several = if single.is_some() { title("any number of iterations") } else { String::new() };
-            context.clear();
-            emit::emit(func, None, &mut context.func, builder, *isa);
-            return part(several, *isa, context);
-        }
-        let facts = Facts::of(func);
-        let outlined = outline(func, &facts, *lengths).ok_or_else(|| too_large(func))?;
-        context.clear();
-        emit_outlined::emit_loop(func, &facts, &outlined, &mut context.func, builder, *isa);
-        part(title("the loop around its pieces"), *isa, context)?;
-        let mut values = Vec::new();
-        for number in 0..outlined.pieces.len() {
-            context.clear();
-            emit_outlined::emit_piece(func, &facts, (&outlined, number), &mut values, &mut context.func, builder, *isa);
-            part(title(&format!("piece {number}")), *isa, context)?;
         }
         Ok(())
     }
-}
-
-/// The function without the step counter, which the caller of a single iteration keeps, see [`abi::table::Entry`];
-/// unchanged if something else reads the counter.
-fn uncounted(func: &Func) -> Func {
-    let mut uncounted = func.clone();
-    uncounted.stores.retain(|(slot, _)| *slot != Slot::COUNT);
-    let uncounted = prune(&uncounted);
-    if uncounted.loads().contains(&Slot::COUNT) { func.clone() } else { uncounted }
 }
 
 /// A comment line before a part of a listing.

@@ -1,14 +1,14 @@
 //! Unswitching: a condition that several automata of a step test is tested once, and the step is duplicated for each
 //! answer.
 //!
-//! In: a verified, expanded function. Out: the condition to [unswitch](unswitchable), and the residual function when
-//! its answer is [known](assuming). Example: four sliding springs test the direction of the same motion, each once per
-//! mode. It knows nothing of processors.
+//! In: a step in one block. Out: a block that tests the condition, and the residual step for each answer. Example: four
+//! sliding springs test the direction of the same motion, each once per mode. It knows nothing of processors.
 //!
 //! Source: Allen, Cocke, *A Catalogue of Optimizing Transformations*, 1972, there for loops.
 
 use crate::codegen::specialise_modes::shared_operands;
 use crate::ir::build::Build;
+use crate::ir::cfg::{Block, BlockId, Cfg, Inst, Part, Terminator};
 use crate::ir::partial_eval::{known, partial_eval, slice};
 use crate::ir::{Func, Op, Value};
 use std::collections::HashSet;
@@ -18,10 +18,31 @@ const MIN_AUTOMATA: usize = 3;
 /// Maximum number of operations of a function that is duplicated.
 const MAX_OPS: usize = 400;
 
+/// Maximum depth of nested unswitching; each level doubles the code.
+const MAX_DEPTH: usize = 2;
+
+/// Unswitches the conditions of the step.
+pub fn unswitch(cfg: &mut Cfg) {
+    of_block(cfg, BlockId(0), 0);
+}
+
+fn of_block(cfg: &mut Cfg, block: BlockId, depth: usize) {
+    let Some(func) = cfg.straight_line(block).filter(|_| depth < MAX_DEPTH) else { return };
+    let Some(condition) = unswitchable(&func) else { return };
+    let to = cfg.append(&func.ops);
+    let live = func.live_for([condition].into_iter());
+    let test = (0..func.ops.len()).filter(|i| live[*i]).map(|i| to(Value(i as u32)));
+    let insts = test.filter(|value| !cfg.is_free(*value)).map(Inst::Compute).collect();
+    let [yes, no] = [true, false].map(|truth| cfg.import(&assuming(&func, condition, truth), Part::Body));
+    let end = Terminator::Branch { when: to(condition), yes: yes.into(), no: no.into() };
+    cfg.blocks[block.index()] = Block { part: Part::Body, params: Vec::new(), insts, end };
+    [yes, no].into_iter().for_each(|side| of_block(cfg, side, depth + 1));
+}
+
 /// The condition to unswitch: the comparison that most automata share, if at least three do. Only comparisons of
 /// constants and of slots that the step does not store come into question: they are available before all other
 /// operations.
-pub fn unswitchable(func: &Func) -> Option<Value> {
+pub(super) fn unswitchable(func: &Func) -> Option<Value> {
     if func.ops.len() > MAX_OPS {
         return None;
     }
@@ -42,7 +63,7 @@ pub fn unswitchable(func: &Func) -> Option<Value> {
 }
 
 /// The residual function when the boolean `condition` has the value `truth`.
-pub fn assuming(func: &Func, condition: Value, truth: bool) -> Func {
+fn assuming(func: &Func, condition: Value, truth: bool) -> Func {
     let mut build = Build::of(func);
     let known = known(&mut build, condition, truth);
     let results: Vec<Value> = func.results().collect();

@@ -38,64 +38,51 @@ impl Variance {
 pub struct Slots<'l> {
     stored: HashSet<Slot>,
     layout: Option<&'l Layout>,
-    first_of_time: Option<Slot>,
 }
 
 impl<'l> Slots<'l> {
     /// The slots of a function that stores these. Without a layout no slot is known to be a parameter.
     pub fn new(stored: impl Iterator<Item = Slot>, layout: Option<&'l Layout>) -> Slots<'l> {
-        Slots { stored: stored.collect(), layout, first_of_time: None }
-    }
-
-    /// The slots from `first` on, after the block, hold a value for each step that depends on time alone.
-    pub fn with_values_of_time(self, first: Option<Slot>) -> Slots<'l> {
-        Slots { first_of_time: first, ..self }
+        Slots { stored: stored.collect(), layout }
     }
 
     /// The variance of a load.
     pub fn of(&self, slot: Slot) -> Variance {
         match slot {
             Slot::TIME | Slot::COUNT if self.stored.contains(&slot) => Variance::Time,
-            slot if self.first_of_time.is_some_and(|first| first <= slot) => Variance::Time,
             slot if self.stored.contains(&slot) => Variance::State,
             Slot::STEP => Variance::Parameters,
             slot if self.layout.is_some_and(|layout| layout.params.contains(slot)) => Variance::Parameters,
             _ => Variance::Inputs,
         }
     }
+
+    fn of_func(func: &Func, layout: Option<&'l Layout>) -> Slots<'l> {
+        Slots::new(func.stores.iter().map(|(slot, _)| *slot), layout)
+    }
 }
 
 /// The variance of each value of a function. With a layout, parameters are told apart from inputs.
 pub fn variance(func: &Func, layout: Option<&Layout>) -> Vec<Variance> {
-    of_slots(func, &Slots::new(func.stores.iter().map(|(slot, _)| *slot), layout))
+    of_ops(&func.ops, &Slots::of_func(func, layout), |_| Variance::Parameters)
 }
 
-/// As [`variance`], with the slots given.
-pub fn of_slots(func: &Func, slots: &Slots) -> Vec<Variance> {
-    propagate(
-        func.ops.len(),
-        |i| own(slots, func.ops[i]),
-        |i, each| {
-            func.ops[i].each_operand(|operand| each(operand.index()));
-        },
-    )
+/// The variance of each of some operations. `at_least`: the least variance of the operation with this index.
+pub fn of_ops(ops: &[Op], slots: &Slots, at_least: impl Fn(usize) -> Variance) -> Vec<Variance> {
+    let own = |i: usize| own(ops[i], slots).max(at_least(i));
+    propagate(ops.len(), own, |i, each| ops[i].each_operand(|operand| each(operand.index())))
 }
 
 /// As [`variance`], where the condition of a select does not count: for latencies, because a branch predictor hides
 /// that of a condition.
 pub fn of_data(func: &Func, layout: &Layout) -> Vec<Variance> {
-    let slots = Slots::new(func.stores.iter().map(|(slot, _)| *slot), Some(layout));
-    propagate(
-        func.ops.len(),
-        |i| own(&slots, func.ops[i]),
-        |i, each| {
-            func.ops[i].each_data_operand(|operand| each(operand.index()));
-        },
-    )
+    let slots = Slots::of_func(func, Some(layout));
+    let own = |i: usize| own(func.ops[i], &slots);
+    propagate(func.ops.len(), own, |i, each| func.ops[i].each_data_operand(|operand| each(operand.index())))
 }
 
 /// What an operation adds to the variance of its operands.
-fn own(slots: &Slots, op: Op) -> Variance {
+fn own(op: Op, slots: &Slots) -> Variance {
     match op {
         Op::Load(slot) => slots.of(slot),
         Op::Ring { .. } => Variance::Samples,

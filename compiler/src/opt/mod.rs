@@ -72,6 +72,12 @@ pub fn optimise(step: Func, context: Context) -> Func {
     optimise_observed(step, context, &mut |_, _, _| ())
 }
 
+/// As [`optimise`], without one pass: for measurements.
+pub fn optimise_without(step: Func, context: Context, off: Option<&str>) -> Func {
+    let passes = PASSES.iter().filter(|pass| off != Some(pass.name));
+    passes.fold(step, |func, pass| (pass.run)(&func, context))
+}
+
 /// Like [`optimise`]. `ran` is called after each pass, with the number of operations before and after it.
 pub fn optimise_observed(step: Func, context: Context, ran: &mut dyn FnMut(&'static Pass, usize, usize)) -> Func {
     PASSES.iter().fold(step, |func, pass| {

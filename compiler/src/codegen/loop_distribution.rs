@@ -1,31 +1,32 @@
-//! Divides a step for loop distribution, by what its operations depend on.
+//! Loop distribution: one loop over steps becomes two, a vectorised leading loop for everything that depends on time
+//! alone, and a remaining loop for the states.
 //!
-//! In: a verified, expanded step. Out: its operations, each unchanged, in three functions that together return the same
-//! bits:
+//! In: a step in one block. Out: if it pays, the remaining step, which loads the outputs of the leading loop from slots after
+//! the block, and the leading loop, whose lanes are successive instants of time. The leading loop is not made of blocks of
+//! the graph, because it works on a block of its own and the code for lanes reads straight lines. Each operation is
+//! unchanged, so the bits are the same:
 //!
 //! ```text
 //! invariants   operations that no step changes                     from parameters, inputs, step length
-//! leading      operations that depend on these and on time alone   lanes are successive instants
-//! remaining    the step, which loads the outputs of leading
+//! instants     operations that depend on these and on time alone   lanes are successive instants
+//! remaining    the step, which loads the outputs of instants
 //! ```
+//! Only for many steps per call and code in memory: images run in real time, one step per call.
+//!
+//! Source: Kennedy, Allen, *Optimizing Compilers for Modern Architectures*, 2001, ch. 5.
 
+use crate::ir::cfg::{BlockId, Cfg, Leading};
 use crate::ir::variance::{Variance, variance};
 use crate::ir::{Func, Op, Type, Value, verify};
 use abi::{Layout, Slot};
 use std::collections::HashSet;
 
-/// The parts of a step.
-pub struct Distribution {
-    /// On blocks of `layout`: parameters → states. None if there are no invariants.
-    pub invariants: Option<Func>,
-    /// On blocks of `layout`: time, count, parameters, states → outputs.
-    pub leading: Func,
-    /// The step on the model's block; it loads the outputs of `leading` from slots after the block.
-    pub remaining: Func,
-    /// The layout of the first two.
-    pub layout: Layout,
-    /// For each parameter of `layout`, the slot of the model that it copies.
-    pub loads: Vec<Slot>,
+/// Distributes a step that works on blocks of this layout, if that pays.
+pub fn loop_distribution(cfg: &mut Cfg, layout: &Layout) {
+    let Some(func) = cfg.straight_line(BlockId(0)) else { return };
+    if let Some((leading, remaining)) = split(&func, layout.size()) {
+        *cfg = Cfg { leading: Some(Box::new(leading)), ..Cfg::straight(&remaining, cfg.called) };
+    }
 }
 
 /// Minimum effort per step that distribution must save: a fixed part for each batch of instants, and a part for each of
@@ -35,7 +36,7 @@ fn least_effort(passed: usize) -> u32 {
 }
 
 /// Divides a step that works on blocks of `size` slots; none if distribution does not pay.
-pub fn split(func: &Func, size: usize) -> Option<Distribution> {
+fn split(func: &Func, size: usize) -> Option<(Leading, Func)> {
     if !advances_time(func) {
         return None;
     }
@@ -104,13 +105,9 @@ pub fn split(func: &Func, size: usize) -> Option<Distribution> {
             None => remaining.copy(value, &|slot| slot),
         }
     }
-    Some(Distribution {
-        invariants: (!invariants.is_empty()).then(|| first.finish()),
-        leading: leading.finish(),
-        remaining: remaining.finish_as(func),
-        layout,
-        loads,
-    })
+    let invariants = (!invariants.is_empty()).then(|| first.finish());
+    let leading = Leading { invariants, instants: leading.finish(), layout, loads, size };
+    Some((leading, remaining.finish_as(func)))
 }
 
 /// Whether a step adds 1 to its counter, and time, if it is read, is counter × step length, as in every fixed step.
