@@ -138,6 +138,8 @@ pub enum Cause {
         step: f64,
         /// The state with the largest error.
         path: String,
+        /// Its magnitude over that at which its error is controlled; large where it grows without bound.
+        grown: f64,
     },
     /// The run exceeds the limit of steps.
     TooManySteps {
@@ -188,7 +190,11 @@ impl fmt::Display for Failure {
             }
             Cause::NotFinite { path, .. } => write!(f, "`{path}` is infinite at {time}"),
             Cause::Chatter(chatter) => write!(f, "chatters at {time}: {chatter}"),
-            Cause::StepTooShort { step, path } => {
+            Cause::StepTooShort { path, grown, .. } if *grown > 1e9 => write!(
+                f,
+                "`{path}` grows without bound up to {time}: check the signs in its equation, where it may drive itself"
+            ),
+            Cause::StepTooShort { step, path, .. } => {
                 let step = format::time(*step);
                 write!(
                     f,

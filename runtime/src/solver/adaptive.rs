@@ -34,6 +34,7 @@ const MOST_ATTEMPTS: u64 = 5_000_000;
 
 /// More events than this within a millionth of the run are chattering.
 const MOST_EVENTS: usize = 100;
+const SOON: f64 = 1e-6;
 
 /// So are more surfaces than this, met by accepted or rejected steps, while no state moves by more than three times the
 /// square root of the tolerance. An oscillation with growing frequency that loses a fraction a² of its amplitude a at
@@ -129,6 +130,8 @@ pub(crate) struct Adaptive {
     fresh: bool,
     /// Time and a crossed surface of each of the most recent events.
     events: VecDeque<(f64, Option<usize>)>,
+    /// For each surface the time of its last event.
+    last_events: Vec<f64>,
     /// The number of surfaces met since a given time, and the states then; whether the last attempt was too long only
     /// because of a surface.
     crossings: usize,
@@ -253,6 +256,7 @@ impl Adaptive {
             moved: true,
             fresh: true,
             events: VecDeque::new(),
+            last_events: vec![f64::NEG_INFINITY; system.surfaces()],
             crossings: 0,
             crossings_since: 0.0,
             crossings_at: system.instance.block()[system.states.clone()].to_vec(),
@@ -559,7 +563,7 @@ impl Adaptive {
         let mut from = 0.0;
         while met && let Some(crossing) = self.surfaces.first(&mut self.system, &self.step, from) {
             let jump = self.jump(crossing);
-            if self.acts(crossing, jump > 0.0)? {
+            if self.acts(crossing, jump > 0.0 && !self.repeats_without_effect(crossing, jump))? {
                 self.creep = f64::INFINITY;
                 self.aimed.fill(0);
                 return self.guard();
@@ -670,11 +674,12 @@ impl Adaptive {
         self.reach();
         self.suspect = f64::INFINITY;
         self.work.events += 1;
+        self.surfaces.changed().for_each(|surface| self.last_events[surface] = time);
         let surface = self.surfaces.changed().next();
         self.events.push_back((time, surface));
         if self.events.len() > MOST_EVENTS {
             let (first, _) = self.events.pop_front().expect("there are more than a hundred");
-            if time - first < 1e-6 * self.duration {
+            if time - first < SOON * self.duration {
                 return Err(self.chatter(MOST_EVENTS, time - first));
             }
         }
@@ -863,7 +868,11 @@ impl Adaptive {
             }
             // At a surface that is met again within the shortest step, the model switches faster than time can resolve.
             None if self.overran => self.chatter(1, h),
-            None => self.stop(Cause::StepTooShort { step: h, path: self.worst() }),
+            None => {
+                let size = |(x, unit): (&f64, &f64)| x.abs() / unit;
+                let grown = self.x.iter().zip(&self.units).map(size).fold(0.0, f64::max);
+                self.stop(Cause::StepTooShort { step: h, path: self.worst(), grown })
+            }
         }
     }
 

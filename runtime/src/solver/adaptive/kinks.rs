@@ -1,8 +1,11 @@
 //! Handles steps that cross a surface where derivatives jump or have a kink: decides whether the step is repeated, and
 //! up to where.
 
-use super::{Adaptive, MOST_AIMS, Step, copy};
+use super::{Adaptive, MOST_AIMS, SOON, Step, copy};
 use crate::solver::surfaces::Crossing;
+
+/// A deviation that does not matter, in allowed errors.
+const NEGLIGIBLE: f64 = 0.1;
 
 impl Adaptive {
     /// Whether the step is repeated because of a surface that it crosses; and whether it crosses any.
@@ -169,7 +172,7 @@ impl Adaptive {
         let h = self.step.h;
         let (to, behind) = (crossing.near * h, (1.0 - crossing.near) * h);
         let (shorter, creep) = if jump > 0.0 {
-            if jump * behind <= 0.1 {
+            if jump * behind <= NEGLIGIBLE {
                 return false;
             }
             // Not within the bracket, where the location is unknown.
@@ -180,10 +183,10 @@ impl Adaptive {
                 return false;
             }
             let bend = self.bend(crossing);
-            if 0.5 * bend * behind * behind <= 0.1 {
+            if 0.5 * bend * behind * behind <= NEGLIGIBLE {
                 return false;
             }
-            (to + (0.1 / bend).sqrt(), f64::INFINITY)
+            (to + (NEGLIGIBLE / bend).sqrt(), f64::INFINITY)
         };
         if shorter > 0.99 * h || shorter < 64.0 * f64::EPSILON * self.t {
             return false;
@@ -220,6 +223,18 @@ impl Adaptive {
             }
         }
         rate
+    }
+
+    /// Whether each surface of a crossing had an event just before, and the jump cannot move a state by more than a tenth
+    /// of the allowed error within the rest of the step. It then needs no event.
+    ///
+    /// A state that rests on a surface, such as a slider on its yield surface, is beside it by a rounding error. A step
+    /// that reaches beyond another surface, at which the slider is released, bends its polynomial by less than the
+    /// allowed error, and yet across the first surface. Events there would repeat until the release.
+    pub(super) fn repeats_without_effect(&self, crossing: Crossing, jump: f64) -> bool {
+        let recent = self.step.time(crossing.far) - SOON * self.duration;
+        self.surfaces.changed().all(|surface| self.last_events[surface] > recent)
+            && jump * (1.0 - crossing.near) * self.step.h <= NEGLIGIBLE
     }
 
     /// The jump in the rates of the derivatives (a kink) at a crossing, in error tolerances of their states per
