@@ -34,12 +34,13 @@ fn number(answers: &Value, test: &str, name: &str) -> f64 {
     found.unwrap_or_else(|| panic!("no {name} in {test}"))["value"].as_f64().unwrap()
 }
 
-/// Verdicts in the order of `keys`: `+` shown, `-` not shown, `.` not applicable.
+/// Verdicts in the order of `keys`: `+` shown, `-` not shown, `.` not applicable, `?` could not be run.
 fn verdicts(answers: &Value, keys: &[&str]) -> String {
     let phenomena = answers["phenomena"].as_array().unwrap();
     let mark = |key: &&str| match phenomena.iter().find(|one| one["key"] == *key).unwrap()["seen"].as_str().unwrap() {
         "shown" => '+',
         "not-shown" => '-',
+        "not-run" => '?',
         _ => '.',
     };
     keys.iter().map(mark).collect()
@@ -104,6 +105,64 @@ fn the_table_of_phenomena_goes_on_with_bristles_and_elements() {
     let gms = answers("gms", "GMS");
     assert_eq!(verdicts(&gms, &TABLE), "+++++++-");
     assert_eq!(verdicts(&gms, &["stick_slip", "no_drift", "symmetric"]), "+++");
+}
+
+/// Drift under a load that oscillates below break-away: Dahl, Bouc–Wen and LuGre drift, elasto-plastic and Maxwell slip
+/// elements do not (Dupont, Hayward, Armstrong, Altpeter 2002). Dahl's force is Fc (1 − exp(−σ x/Fc)), so 99 % of it is
+/// reached at x = ln(100) Fc/σ; so is that of Bouc–Wen with exponent 1.
+#[test]
+fn drift_and_travel_are_those_of_the_literature() {
+    let exponential = 4.605_170_186e-5 * 1.000_2;
+    for (model, drifts, travel) in [
+        ("Dahl", "+-", Some(exponential)),
+        ("BoucWen", "+-", Some(exponential)),
+        ("ElastoPlastic", "++", None),
+        ("MaxwellSlip", "++", None),
+        ("KFM", "++", Some(0.0)),
+    ] {
+        let seen = answers(&format!("drift_{model}"), model);
+        assert_eq!(verdicts(&seen, &["holds", "no_drift"]), drifts, "{model}");
+        let found = seen["scales"]["break_away_travel"].as_f64().unwrap();
+        if let Some(travel) = travel {
+            assert!((found - travel).abs() <= 1e-3 * travel, "{model}: {found:e}");
+        }
+    }
+}
+
+/// Five elements with yield surfaces as people write them (Iwan): no cross where nothing was wrong, no fallback at rest.
+#[test]
+fn elements_with_yield_surfaces_are_characterised() {
+    let folder = folder("iwan");
+    let text = "model Jenkins {\n  input v [m/s]\n  param k = 8 N/mm in > 0\n  param phi = 0.5 N in > 0\n\
+        state z [um] = 0\n  dz/dt = if abs(k * z) < phi or v * z < 0 then v else 0\n  output f [N] = k * z\n}\n\
+        model Iwan {\n  input v [m/s]\n  part el[i in 1 .. 5] = Jenkins(v = v, phi = i * 0.05 N)\n  output F [N] = sum(el.f)\n}\n";
+    fs::write(folder.join("iwan.fric"), text).unwrap();
+    let seen: Value = serde_json::from_str(&fric(&folder, &["characterise", "iwan.fric", "Iwan", "--json"])).unwrap();
+    let keys =
+        ["holds", "no_drift", "presliding", "hysteresis", "return_point_memory", "rate_independent", "dissipative"];
+    assert_eq!(verdicts(&seen, &keys), "+++++++", "{seen}");
+    // The last element yields at 0.25 N / 8 N/mm; 99 % of the force, 0.7425 N, is reached 7.5 mN / 8 N/mm before.
+    let travel = seen["scales"]["break_away_travel"].as_f64().unwrap();
+    assert!((travel - (31.25e-6 - 0.9375e-6)).abs() < 1e-9, "{travel:e}");
+    assert_eq!(seen["notes"].as_array().unwrap().len(), 0, "{}", seen["notes"]);
+}
+
+/// A family over an input; the report of one lists what was held.
+#[test]
+fn a_family_goes_over_an_input() {
+    let folder = folder("family");
+    let text = "model Loaded {\n  input v [m/s]\n  input N [N] = 10 N in > 0\n  param mu = 0.3 in > 0\n\
+        param k = 1e5 N/m in > 0\n  state z [um] = 0\n  dz/dt = v - k * abs(v) / (mu * N) * z\n  output F [N] = k * z\n}\n";
+    fs::write(folder.join("loaded.fric"), text).unwrap();
+    let alone = fric(&folder, &["characterise", "loaded.fric", "Loaded"]);
+    assert!(alone.contains("these inputs were held: N = 10 N (default)"), "{alone}");
+    let family = fric(&folder, &["characterise", "loaded.fric", "Loaded", "--over", "N = 5 N, 20 N", "--json"]);
+    let forces: Vec<f64> = family
+        .lines()
+        .map(|line| serde_json::from_str::<Value>(line).unwrap()["scales"]["break_away_force"].as_f64().unwrap())
+        .collect();
+    assert!((forces[0] - 1.5).abs() < 0.01 && (forces[1] - 6.0).abs() < 0.03, "{forces:?}");
+    assert_self_contained(&fs::read_to_string(folder.join("out/Loaded/compare.html")).unwrap());
 }
 
 #[test]

@@ -16,8 +16,11 @@ pub struct Scales {
     pub mass: f64,
     /// Break-away force under a slow ramp.
     pub f_b: f64,
-    /// Displacement at break-away.
+    /// Displacement at the greatest force before it slides: the size of motions. A contact without a peak still gains
+    /// force while its mass accelerates.
     pub x_b: f64,
+    /// Displacement at which the force first reaches 99 % of `f_b`: the travel at break-away.
+    pub travel: f64,
     /// Least sliding friction after the peak.
     pub f_c: f64,
     /// Speed at which the excess over `f_c` has decayed to 1/e; else a hundredth of the greatest speed.
@@ -69,6 +72,9 @@ impl Units {
         if rotary { ROTARY } else { STRAIGHT }
     }
 }
+
+/// The experiment on drift: when its oscillation has become periodic, and its end, s.
+pub const DRIFT: (f64, f64) = (12.0, 32.0);
 
 /// One experiment of the battery.
 #[derive(Clone, Debug)]
@@ -522,18 +528,19 @@ impl<'a> Layout<'a> {
 
         // A load that the contact can hold, if it can hold any.
         let load = if s.f_c > 0.01 * f_b { s.f_c } else { f_b };
+        let (lifted, shaken) = (n(round(0.6 * load)), n(round(0.3 * load)));
         entries.push(shaded(
             motion(Entry::new(
                 "drift",
-                "A constant load with a small oscillation, both below break-away.",
-                self.force_bench(
-                    &format!("{} {force} + sine({} {force}, 1 Hz)", n(round(0.6 * load)), n(round(0.3 * load))),
-                    "",
+                "A constant load, applied gently, with a small oscillation: both together below break-away.",
+                format!(
+                    "Damped(u = if t < 2 s then {lifted} {force} * (1 - cos(pi * t / 2 s)) / 2 \
+                     else {lifted} {force} + {shaken} {force} * sin(2 * pi * 1 Hz * (t - 2 s)))"
                 ),
-                20.0,
+                DRIFT.1,
             ))
             .solver("adaptive tol 1e-8"),
-            "fr",
+            "bench.fr",
         ));
         let half = round(0.5 * load);
         entries.push(shaded(

@@ -144,7 +144,8 @@ type Compiled = (String, Result<Vec<compile::Case>, String>);
 /// Compiles experiments on all cores; the results are in order.
 fn compiled(loaded: &Loaded, names: &[String], sources: &(dyn compile::Sources + Sync)) -> Vec<Compiled> {
     let one = |loaded: &mut Loaded, name: &String| {
-        let options = Options { changes: Changes::default(), interpret: false };
+        // The step-size sweep shows what too long a step does.
+        let options = Options { changes: Changes { any_step: true, ..Changes::default() }, interpret: false };
         let mut warnings = Vec::new();
         let cases = compile::compile(loaded, sources, name, &options, &mut warnings, &mut |_| ());
         (name.clone(), cases.map_err(|found| report::full(&loaded.files.0, &found, false)))

@@ -298,7 +298,7 @@ pub(super) fn scale_rows(study: &Study) -> [(&'static str, String); 4] {
     let scales = &study.scales;
     [
         ("break-away force of a slow ramp, F_b", shown(scales.f_b, study.units.force)),
-        ("travel until then, x_b", shown(scales.x_b, study.units.length)),
+        ("travel to 99 % of it, x_b", shown(scales.travel, study.units.length)),
         ("least force of sliding, F_c", shown(scales.f_c, study.units.force)),
         ("speed scale, v_s", shown(scales.v_s, study.units.speed)),
     ]
@@ -360,7 +360,7 @@ fn class(seen: Seen) -> &'static str {
     match seen {
         Seen::Shown => "yes",
         Seen::NotShown => "no",
-        Seen::NotApplicable => "na",
+        Seen::NotApplicable | Seen::NotRun => "na",
     }
 }
 
@@ -369,6 +369,7 @@ fn mark(seen: Seen) -> &'static str {
         Seen::Shown => "<span class=\"mark\">✓</span>",
         Seen::NotShown => "<span class=\"mark\">✗</span>",
         Seen::NotApplicable => "<span class=\"mark\">–</span>",
+        Seen::NotRun => "<span class=\"mark\">?</span>",
     }
 }
 

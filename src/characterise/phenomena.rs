@@ -29,6 +29,8 @@ pub enum Seen {
     NotShown,
     /// It does not apply to this model.
     NotApplicable,
+    /// It was not seen, but its experiment could not be run as it is: a fixed step took its place.
+    NotRun,
 }
 
 impl Seen {
@@ -38,6 +40,7 @@ impl Seen {
             Seen::Shown => "shown",
             Seen::NotShown => "not shown",
             Seen::NotApplicable => "not applicable",
+            Seen::NotRun => "could not be run",
         }
     }
 
@@ -47,13 +50,21 @@ impl Seen {
             Seen::Shown => "shown",
             Seen::NotShown => "not-shown",
             Seen::NotApplicable => "not-applicable",
+            Seen::NotRun => "not-run",
         }
     }
 }
 
-/// All findings, in the order of the table.
-pub fn findings(subject: &Subject, scales: &Scales, tests: &[Test], chatter: Option<&str>) -> Vec<Finding> {
-    let look = Look { subject, scales, tests, chatter };
+/// All findings, in the order of the table. `stepped`: experiments that could not be run adaptively and were run with a
+/// fixed step instead; `chatter`: what turned without end in them.
+pub fn findings(
+    subject: &Subject,
+    scales: &Scales,
+    tests: &[Test],
+    stepped: &[String],
+    chatter: Option<&str>,
+) -> Vec<Finding> {
+    let look = Look { subject, scales, tests, stepped, chatter };
     vec![
         look.finding("holds", "holds a load at rest", Look::holds),
         look.finding("no_drift", "keeps its place when shaken", Look::no_drift),
@@ -76,10 +87,30 @@ struct Look<'a> {
     subject: &'a Subject,
     scales: &'a Scales,
     tests: &'a [Test],
+    stepped: &'a [String],
     chatter: Option<&'a str>,
 }
 
+/// The experiments from which a verdict comes, by the beginning of their names.
+fn experiments(key: &str) -> &'static [&'static str] {
+    match key {
+        "holds" => &["hold"],
+        "no_drift" => &["hold", "drift"],
+        "stiction_peak" => &["break_away"],
+        "presliding" | "hysteresis" | "return_point_memory" => &["hold", "presliding"],
+        "lag" => &["lag"],
+        "varying_break_away" => &["break_away", "reversal"],
+        "stick_slip" => &["stick_slip"],
+        "rate_independent" => &["rate"],
+        "dissipative" => &["closed_path"],
+        "stribeck" | "viscous" | "symmetric" => &["steady"],
+        key => unreachable!("no phenomenon {key}"),
+    }
+}
+
 type Answer = (Seen, String);
+
+const NO_PRESLIDING: &str = "no presliding";
 
 fn when(shown: bool, why: String) -> Answer {
     (if shown { Seen::Shown } else { Seen::NotShown }, why)
@@ -88,7 +119,28 @@ fn when(shown: bool, why: String) -> Answer {
 impl Look<'_> {
     fn finding(&self, key: &'static str, name: &'static str, look: fn(&Self) -> Answer) -> Finding {
         let (seen, why) = look(self);
+        // What a fixed step shows of a model that cannot be run is no evidence against it.
+        if seen != Seen::Shown
+            && self.is_stepped(experiments(key))
+            && !(seen == Seen::NotApplicable && self.is_static())
+        {
+            let cause = match self.chatter {
+                Some(chatter) => format!("{chatter} without end"),
+                None => "it takes too many steps".into(),
+            };
+            let why = why.strip_prefix(NO_PRESLIDING).map_or(format!("; with a fixed step: {why}"), |_| String::new());
+            return Finding { key, name, seen: Seen::NotRun, why: format!("{cause}{why}") };
+        }
         Finding { key, name, seen, why }
+    }
+
+    /// Whether one of these experiments could only be run with a fixed step.
+    fn is_stepped(&self, experiments: &[&str]) -> bool {
+        let one = |name: &String| {
+            let digits = |rest: &str| rest.is_empty() || rest.starts_with('_');
+            experiments.iter().any(|begin| name.strip_prefix(begin).is_some_and(digits))
+        };
+        self.stepped.iter().any(one)
     }
 
     fn test(&self, key: &str) -> Result<&Test, Answer> {
@@ -117,8 +169,8 @@ impl Look<'_> {
             Ok(test) => test,
             Err(answer) => return answer,
         };
-        if self.chatter.is_some() && self.subject.external == External::Absent {
-            return (Seen::NotShown, "needs F_ext: without it the force jumps to and fro at rest".into());
+        if self.is_stepped(&["hold"]) && self.subject.external == External::Absent {
+            return (Seen::NotShown, "the force jumps to and fro at rest".into());
         }
         let (moved, creep) = (Self::number(test, "held_peak_to_peak"), Self::number(test, "creep_speed"));
         let (Some(moved), Some(creep)) = (moved, creep) else { return (Seen::NotApplicable, "not measured".into()) };
@@ -145,8 +197,12 @@ impl Look<'_> {
             Ok(test) => test,
             Err(answer) => return answer,
         };
-        let Some(drift) = Self::number(test, "drift") else { return (Seen::NotApplicable, "not measured".into()) };
-        when(drift.value.abs() < 1e-9, format!("drifts {} in a cycle", drift.shown()))
+        let (Some(drift), Some(swing)) = (Self::number(test, "drift"), Self::number(test, "swing")) else {
+            return (Seen::NotApplicable, "not measured".into());
+        };
+        // A trend is more than the tolerance of the run leaves of a cycle.
+        let trend = drift.value.abs() >= 1e-9_f64.max(1e-5 * swing.value.abs());
+        when(!trend, format!("drifts {} in a cycle of {}", drift.shown(), swing.shown()))
     }
 
     fn stiction_peak(&self) -> Answer {
@@ -203,7 +259,7 @@ impl Look<'_> {
     }
 
     fn presliding(&self) -> Answer {
-        if self.chatter.is_some() {
+        if self.is_stepped(&["hold", "presliding"]) {
             return (Seen::NotShown, "at rest the force jumps to and fro".into());
         }
         let test = match self.test("presliding") {
@@ -227,7 +283,7 @@ impl Look<'_> {
 
     fn hysteresis(&self) -> Answer {
         if self.presliding().0 != Seen::Shown {
-            return (Seen::NotApplicable, "no presliding".into());
+            return (Seen::NotApplicable, NO_PRESLIDING.into());
         }
         let area = self.test("presliding").ok().and_then(|test| Self::number(test, "loop_area"));
         let Some(area) = area else { return (Seen::NotApplicable, "not measured".into()) };
@@ -239,7 +295,7 @@ impl Look<'_> {
         match hysteresis {
             Seen::Shown => {}
             Seen::NotShown => return (Seen::NotApplicable, format!("elastic, so every loop closes: {why}")),
-            Seen::NotApplicable => return (Seen::NotApplicable, why),
+            Seen::NotApplicable | Seen::NotRun => return (Seen::NotApplicable, why),
         }
         let error = self.test("presliding").ok().and_then(|test| Self::number(test, "memory_error"));
         let Some(error) = error else { return (Seen::NotApplicable, "not measured".into()) };
@@ -282,7 +338,7 @@ impl Look<'_> {
         };
         let viscous =
             self.test("steady").ok().and_then(|test| Self::number(test, "viscous_slope")).map_or(0.0, |n| n.value);
-        if change.value > 0.02 + viscous.abs() * self.scales.v_slip / slow.value && self.chatter.is_none() {
+        if change.value > 0.02 + viscous.abs() * self.scales.v_slip / slow.value && !self.is_stepped(&["break_away"]) {
             return when(
                 true,
                 format!("with the rate: {} {}, {} {}", slow.shown(), slow.name, fast.shown(), fast.name),
@@ -353,7 +409,7 @@ impl Look<'_> {
             None => when(
                 true,
                 format!(
-                    "least work of six rounds {}; not searched: that needs a `storage` and ranges of its states",
+                    "least work of six rounds {}; not proven: that needs a `storage` and ranges of its states",
                     least.shown()
                 ),
             ),

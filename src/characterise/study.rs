@@ -126,8 +126,17 @@ pub fn study(subject: Subject, name: &str, sources: &(dyn Sources + Sync), exten
     };
     // Rotary twins of translational models keep their numbers; models written for shafts run faster.
     let v_max = if rotary && !subject.instance.is_rotary() { 10.0 } else { 1.0 };
-    let mut scales =
-        Scales { f_ref: 0.0, mass: 1.0, f_b: 0.0, x_b: 0.0, f_c: 0.0, v_s: 0.01 * v_max, v_slip: 0.01 * v_max, v_max };
+    let mut scales = Scales {
+        f_ref: 0.0,
+        mass: 1.0,
+        f_b: 0.0,
+        x_b: 0.0,
+        travel: 0.0,
+        f_c: 0.0,
+        v_s: 0.01 * v_max,
+        v_slip: 0.01 * v_max,
+        v_max,
+    };
 
     runner.run(&scales, |layout| vec![layout.scale_sliding()])?;
     let sliding = runner.one("scale_sliding")?.rows().map_err(|why| format!("does not slide steadily: {why}"))?;
@@ -143,6 +152,7 @@ pub fn study(subject: Subject, name: &str, sources: &(dyn Sources + Sync), exten
         let rows = runner.one("scale_break_away")?.rows().map_err(|why| format!("cannot be pushed: {why}"))?;
         if let Some((force, travel)) = break_away(&rows, scales.v_slip) {
             (scales.f_b, scales.x_b) = (force, travel.abs());
+            scales.travel = travel_to(&rows, 0.99 * force).map_or(scales.x_b, f64::abs);
             stiffness = early_stiffness(&rows, force).unwrap_or(f64::INFINITY);
             break;
         }
@@ -179,8 +189,20 @@ pub fn study(subject: Subject, name: &str, sources: &(dyn Sources + Sync), exten
         reference: runner.entries.iter().find(|entry| entry.name == "steps_reference").and_then(Entry::step),
     };
     let tests = reader.tests(dissipation);
-    let findings = phenomena::findings(&subject, &scales, &tests, chatter.as_deref());
+    // The step-size sweep has fixed steps on purpose.
+    let stepped = runner.entries.iter().filter(|entry| !entry.adaptive() && !entry.name.starts_with("steps_"));
+    let stepped: Vec<String> = stepped.map(|entry| entry.name.clone()).collect();
+    let findings = phenomena::findings(&subject, &scales, &tests, &stepped, chatter.as_deref());
     let mut notes = Vec::new();
+    if !subject.held.is_empty() {
+        let one = |(name, value): &(String, String)| format!("{name} = {value}");
+        let held: Vec<String> = subject.held.iter().map(one).collect();
+        notes.push(format!(
+            "Beside v, these inputs were held: {}. `--over '{} = …, …'` draws a family over one of them.",
+            held.join(", "),
+            subject.held[0].0
+        ));
+    }
     if slow {
         notes.push(
             "Some adaptive runs took too many steps, and were run with a fixed step: what happens within one is not seen."
@@ -290,6 +312,14 @@ fn break_away(rows: &[Vec<f64>], v_slip: f64) -> Option<(f64, f64)> {
     let end = rows.iter().position(|row| row[3].abs() >= v_slip)?;
     let best = rows[..=end].iter().max_by(|a, b| a[1].total_cmp(&b[1]))?;
     Some((best[1], best[2]))
+}
+
+/// Displacement at which the force first reaches a value. Rows hold t, F, x, v.
+fn travel_to(rows: &[Vec<f64>], force: f64) -> Option<f64> {
+    let at = rows.iter().position(|row| row[1] >= force)?;
+    let Some(before) = at.checked_sub(1).map(|before| &rows[before]) else { return Some(rows[at][2]) };
+    let part = (force - before[1]) / (rows[at][1] - before[1]);
+    Some(before[2] + part.clamp(0.0, 1.0) * (rows[at][2] - before[2]))
 }
 
 /// Force per displacement at a tenth of the break-away force. Rows hold t, F, x, v.
@@ -470,7 +500,9 @@ impl Reader<'_> {
             test(
                 "drift",
                 "Drift under a small oscillation",
-                "A load of 0.6 times the sliding force, shaken by 0.3 times it at 1 Hz for 20 s.".into(),
+                "A load of 0.6 times the sliding force, applied within 2 s and then shaken by 0.3 times it at 1 Hz, on a \
+                 lightly damped mass; the trend over 20 cycles."
+                    .into(),
                 self.read_drift(),
             ),
             test(
@@ -620,7 +652,7 @@ impl Reader<'_> {
             })
             .collect();
         numbers.push(self.number("break_away_change", "fall from the greatest to the least", (high - low) / high, ""));
-        numbers.push(self.number("break_away_travel", "travel at break-away", self.scales.x_b, self.units.length));
+        numbers.push(self.number("break_away_travel", "travel at break-away", self.scales.travel, self.units.length));
         Ok((graphs, numbers))
     }
 
@@ -875,7 +907,10 @@ impl Reader<'_> {
 
     fn read_drift(&self) -> Read {
         let rows = self.rows("drift")?;
-        let drift = (value_at(&rows, 20.0, 2) - value_at(&rows, 10.0, 2)) / 10.0;
+        // From whole cycle to whole cycle, in the second half against the first: what has not settled by then is a trend.
+        let (begin, end) = battery::DRIFT;
+        let drift = (value_at(&rows, end, 2) - value_at(&rows, begin, 2)) / (end - begin);
+        let last = &rows[rows.partition_point(|row| row[0] < end - 1.0)..];
         let graph = Graph {
             key: "drift",
             bands: self.regimes(&rows),
@@ -885,7 +920,11 @@ impl Reader<'_> {
             logarithmic: (false, false),
             lines: vec![Line::course("", rows.iter().map(|row| (row[0], row[2])).collect())],
         };
-        Ok((vec![graph], vec![self.number("drift", "drift in a cycle", drift, self.units.length)]))
+        let numbers = vec![
+            self.number("drift", "drift in a cycle", drift, self.units.length),
+            self.number("swing", "swing within a cycle", peak_to_peak(last, 2), self.units.length),
+        ];
+        Ok((vec![graph], numbers))
     }
 
     fn read_energy(&self) -> Read {

@@ -38,6 +38,8 @@ pub struct Subject {
     pub rotary: bool,
     /// Whether it has an input for the external force, and whether it requires it.
     pub external: External,
+    /// Inputs other than the velocity and the external force, each with the value at which it is held, as written.
+    pub held: Vec<(String, String)>,
     /// Its parameters with the values of this instance.
     pub params: Vec<Param>,
     /// Number of continuous states.
@@ -261,6 +263,23 @@ pub fn external(model: &ast::Model) -> External {
         Some((_, true)) => External::Optional,
         Some((_, false)) => External::Required,
     }
+}
+
+/// The inputs beside `v` and `F_ext`, and the values at which they are held: as given, or their defaults.
+pub fn held(loaded: &Loaded, model: &ast::Model, written: &Written) -> Vec<(String, String)> {
+    let inputs = declarations(model).filter(|declaration| declaration.kind == DeclarationKind::Input);
+    let others = inputs.filter(|declaration| !matches!(declaration.name.text.as_str(), "v" | "F_ext"));
+    let value = |declaration: &ast::Declaration| {
+        let name = &declaration.name.text;
+        let given = written.args.iter().find(|(given, _)| given == name).map(|(_, argument)| match argument {
+            Argument::Value(value) => value.clone(),
+            Argument::Model(model) => model.to_string(),
+        });
+        let default =
+            || declaration.value.as_ref().map(|value| format!("{} (default)", loaded.files.slice(value.span)));
+        Some((name.clone(), given.or_else(default)?))
+    };
+    others.filter_map(value).collect()
 }
 
 /// Checks that the ports of a model are those of a friction model; returns whether it is rotary.

@@ -6,6 +6,7 @@ use crate::characterise::subject::{self, Origin, Subject, Written};
 use crate::characterise::{Extent, Seen, Study, latex, page, shown, study};
 use crate::compile::{self, Changes, Loaded, Options};
 use crate::terminal::{Style, Terminal};
+use crate::vary::{How, Vary};
 use crate::{project, report};
 use serde_json::{Value, json};
 use std::path::{Component, Path, PathBuf};
@@ -15,6 +16,9 @@ pub fn characterise(args: &Characterise, terminal: &mut Terminal) -> End {
         Ok(found) => found,
         Err(why) => return failed(terminal, &why),
     };
+    if let Some(over) = &args.over {
+        return family(args, over, terminal);
+    }
     let mut end = End::Fine;
     for (subject, folder) in found {
         let label = subject.instance.label();
@@ -43,6 +47,40 @@ pub fn characterise(args: &Characterise, terminal: &mut Terminal) -> End {
     end
 }
 
+/// A model with several values of one input or parameter, side by side.
+fn family(args: &Characterise, over: &Vary, terminal: &mut Terminal) -> End {
+    let How::Values(values) = &over.how else {
+        terminal.error("--over takes values, such as 'N = 5 N, 10 N': distributions are for `fric sweep`");
+        return End::Misused;
+    };
+    if values.len() > MOST_OVER {
+        terminal.error(&format!("--over takes up to {MOST_OVER} values, and these are {}", values.len()));
+        return End::Misused;
+    }
+    let (mut studies, mut folder, mut end) = (Vec::new(), PathBuf::new(), End::Fine);
+    for value in values {
+        let mut set = args.set.clone();
+        let unit = if over.unit.text.is_empty() { String::new() } else { format!(" {}", over.unit) };
+        set.push((over.path.clone(), format!("{}{unit}", over.unit.from_si(*value))));
+        let found = match subjects(&args.what, &args.models, &set, args.out.as_deref()) {
+            Ok(found) => found,
+            Err(why) => return failed(terminal, &why),
+        };
+        for (subject, own) in found {
+            let label = subject.instance.label();
+            match study(subject, &battery_in(&own), &project::Disk, Extent::Whole) {
+                Ok(study) => studies.push(study),
+                Err(why) => end = failed(terminal, &format!("{label} {why}")),
+            }
+            folder = own;
+        }
+    }
+    compared(&studies, &args.out.clone().unwrap_or(folder), &args.figures, args.json, end, terminal)
+}
+
+/// Most values of `--over`.
+const MOST_OVER: usize = 12;
+
 pub fn compare(args: &Compare, terminal: &mut Terminal) -> End {
     let folder = args.out.clone().unwrap_or_else(|| PathBuf::from("out").join("compare"));
     let mut studies: Vec<Study> = Vec::new();
@@ -60,31 +98,43 @@ pub fn compare(args: &Compare, terminal: &mut Terminal) -> End {
             }
         }
     }
+    compared(&studies, &folder, &args.figures, args.json, end, terminal)
+}
+
+/// Writes the page of several models and prints their table. `end`: how their characterisation ended.
+fn compared(
+    studies: &[Study],
+    folder: &Path,
+    figures: &Figures,
+    as_json: bool,
+    end: End,
+    terminal: &mut Terminal,
+) -> End {
     if studies.is_empty() {
         return End::Failed;
     }
     let path = folder.join("compare.html");
     let all: Vec<&Study> = studies.iter().collect();
     let mut files = vec![
-        ("compare.html".to_string(), page::comparison(&studies).into_bytes()),
-        ("compare.tex".to_string(), latex::tables(&studies).into_bytes()),
+        ("compare.html".to_string(), page::comparison(studies).into_bytes()),
+        ("compare.tex".to_string(), latex::tables(studies).into_bytes()),
     ];
-    let figures = args.figures.files(|| page::figures(&all));
-    let count = if figures.is_empty() { String::new() } else { format!(" and {} figures", figures.len()) };
-    files.extend(figures);
+    let drawn = figures.files(|| page::figures(&all));
+    let count = if drawn.is_empty() { String::new() } else { format!(" and {} figures", drawn.len()) };
+    files.extend(drawn);
     for (name, bytes) in files {
         let path = folder.join(name);
         if let Err(error) = project::write(&path, &bytes) {
             return failed(terminal, &format!("cannot write {}: {error}", path.display()));
         }
     }
-    if args.json {
-        for study in &studies {
+    if as_json {
+        for study in studies {
             terminal.line(&json(study).to_string());
         }
         return end;
     }
-    terminal.print(&table(&studies, terminal));
+    terminal.print(&table(studies, terminal));
     terminal.line(&format!("  wrote {}, compare.tex{count} beside it\n", path.display()));
     end
 }
@@ -202,6 +252,7 @@ pub(super) fn fitted(written: Written, file: Option<&Path>, folder: &Path) -> Re
         equations: subject::equations(&loaded, model, &written),
         rotary,
         external: subject::external(model),
+        held: subject::held(&loaded, model, &written),
         params: subject::params(model, instance),
         states: crate::results::states(description),
         regimes: description.automata.iter().flat_map(|automaton| automaton.regimes.clone()).collect(),
@@ -280,7 +331,7 @@ fn tell(study: &Study, terminal: &mut Terminal) {
     terminal.line(&format!(
         "  lets go at {} after {}, slides with {}",
         shown(scales.f_b, study.units.force),
-        shown(scales.x_b, study.units.length),
+        shown(scales.travel, study.units.length),
         shown(scales.f_c, study.units.force)
     ));
     let width = study.findings.iter().map(|finding| finding.name.chars().count()).max().unwrap_or(0);
@@ -302,6 +353,7 @@ fn mark(seen: Seen, terminal: &Terminal) -> String {
         Seen::Shown => terminal.styled(Style::Good, "✓"),
         Seen::NotShown => terminal.styled(Style::Bad, "✗"),
         Seen::NotApplicable => "–".into(),
+        Seen::NotRun => "?".into(),
     }
 }
 
@@ -350,7 +402,7 @@ fn json(study: &Study) -> Value {
         "rotary": study.subject.rotary,
         "scales": {
             "break_away_force": number(study.scales.f_b),
-            "break_away_travel": number(study.scales.x_b),
+            "break_away_travel": number(study.scales.travel),
             "sliding_force": number(study.scales.f_c),
             "stribeck_speed": number(study.scales.v_s),
             "mass": number(study.scales.mass),
