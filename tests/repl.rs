@@ -524,3 +524,57 @@ fn the_sessions_on_the_pages_print_what_they_show() {
         assert!(page == now, "{name}: {different:?}; BLESS=1 writes what is printed now");
     }
 }
+
+/// Variables, instances by their names, measures in arithmetic, 0 without a unit, and words of other languages.
+#[test]
+fn the_prompt_accepts_what_people_type() {
+    let folder = folder("typed");
+    let script = "x = 3 mm\nx * 2\nf = LuGre(vd = 10 mm/s)\nf.v = x / 1 s\nf.v\nf\nrun f for 1 s\n\
+                  2 * max(f.F) - max(f.F) - max(f.F)\nmax(f.F) * 0\nFs = 2 N\nnames\n";
+    let done = piped(&folder, &["repl"], script);
+    let out = text(&done.stdout);
+    assert_eq!(done.status.code(), Some(0), "{out}\n{}", text(&done.stderr));
+    for line in [
+        "x = 3 mm",
+        "6 mm",
+        "3 mm/s",
+        "  param  f.Fs      1.5 N",
+        "  state  f.z       0 µm",
+        "0 N",
+        "Fs = 2 N   (a variable; `f.Fs = 2 N` sets the param)",
+    ] {
+        assert!(out.lines().any(|one| one == line), "no `{line}` in\n{out}");
+    }
+    assert!(!out.contains("NaN"), "{out}");
+    let cut =
+        piped(&folder, &["repl"], "f = LuGre(vd = 10 mm/s)\nplot f.F against f.v = 0 .. 10 mm/s steady to a.svg\n");
+    assert_eq!(cut.status.code(), Some(0), "{}", text(&cut.stderr));
+    for (line, words) in [
+        ("for i = 1:3", "there are no loops"),
+        ("linearise f", "`fric linearise FILE …`"),
+        ("f = LuGrevd=10 mm/s)", "one `)` too many"),
+    ] {
+        let said = text(&piped(&folder, &["repl"], line).stderr);
+        assert!(said.contains(words), "{line}: {said}");
+    }
+    let doc = text(&piped(&folder, &["repl"], "doc LuGre\n").stdout);
+    assert!(doc.lines().any(|line| line.split_whitespace().take(6).eq(["param", "Fs", "N", "=", "1.5", "N"])), "{doc}");
+}
+
+/// A session that runs an experiment of a file which imports another is saved, into another folder too, and runs there.
+#[test]
+fn a_session_on_imports_of_imports_is_saved() {
+    let folder = folder("imports");
+    fs::create_dir_all(folder.join("parts")).unwrap();
+    fs::write(folder.join("parts/driven.fric"), "model Driven { state x [m] = 0  dx/dt = 1 m/s  output y [m] = x }\n")
+        .unwrap();
+    let outer = "import \"parts/driven.fric\"\nimport std.interfaces\nexperiment go { run Driven() for 1 s  plot y }\n";
+    fs::write(folder.join("outer.fric"), outer).unwrap();
+    for to in ["saved.fric", "deep/down/saved.fric"] {
+        let script = format!("use \"outer.fric\"\nrun go\nexpect final(y) > 0.5 m\nsave {to}\n");
+        let done = piped(&folder, &["repl"], &script);
+        assert_eq!(done.status.code(), Some(0), "{to}: {}", text(&done.stderr));
+        let test = fric(&folder).args(["test", to]).output().unwrap();
+        assert!(test.status.success(), "{to}: {}{}", text(&test.stdout), text(&test.stderr));
+    }
+}

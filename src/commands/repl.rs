@@ -94,6 +94,24 @@ enum Next {
     Quit,
 }
 
+/// Commands of the shell that the prompt does not have.
+const COMMAND_LINE: [&str; 14] = [
+    "linearise",
+    "linearize",
+    "sweep",
+    "test",
+    "check",
+    "build",
+    "hil",
+    "predict",
+    "replay",
+    "fmt",
+    "compare",
+    "bench",
+    "new",
+    "deploy",
+];
+
 /// Executes lines.
 struct Prompt<'a> {
     session: &'a mut Session,
@@ -130,8 +148,22 @@ impl Prompt<'_> {
                 let words = self.session.add_part(&name, &text[begin..])?;
                 self.terminal.line(&words);
             }
+            Line::Setting(path, begin) if !path.contains(['.', '[']) && self.session.is_free(&path) => {
+                let value = self.session.set_variable(&path, &text[begin..])?;
+                let tail = format!(".{path}");
+                let meant =
+                    self.session.quantities().find(|q| q.path.ends_with(&tail) && matches!(q.kind, "param" | "input"));
+                let meant = meant.map_or(String::new(), |q| {
+                    format!("   (a variable; `{} = {}` sets the {})", q.path, text[begin..].trim(), q.kind)
+                });
+                self.terminal.line(&format!("{path} = {}{meant}", plain(&value)));
+            }
             Line::Setting(path, _) => self.session.set(&path, text)?,
             Line::Expression => {
+                if let Some(values) = self.session.part_values(text.trim()) {
+                    self.values(values?);
+                    return Ok(Next::Line);
+                }
                 if let Some(near) = self.misspelt(text) {
                     return Err(Fault::Words(near));
                 }
@@ -144,10 +176,27 @@ impl Prompt<'_> {
         Ok(Next::Line)
     }
 
+    /// Prints the quantities of a part with their values.
+    fn values(&mut self, values: Vec<(crate::compile::Listed, Value)>) {
+        let width = values.iter().map(|(q, _)| q.path.chars().count()).max().unwrap_or(0);
+        for (q, value) in values {
+            self.terminal.line(&format!("  {:<6} {:width$}  {}", q.kind, q.path, plain(&value)));
+        }
+    }
+
     /// Two words in sequence are no expression: suggest a command.
     fn misspelt(&self, text: &str) -> Option<String> {
         let mut words = text.split_whitespace();
         let (first, second) = (words.next()?, words.next());
+        if matches!(first, "for" | "while") && second.is_some() {
+            let help = "several values are a `sweep` in an experiment, a curve is `plot f.F against f.v = 0 .. 1 m/s`";
+            return Some(format!("there are no loops; {help}"));
+        }
+        if second.is_some() && COMMAND_LINE.contains(&first) {
+            return Some(format!(
+                "`{first}` is a command of the shell: `fric {first} FILE …`; `fric {first} --help` says how"
+            ));
+        }
         let word = |word: &str| word.chars().all(|c| c.is_alphanumeric() || c == '_' || c == '.' || c == '"');
         let command = word(first) && first.starts_with(char::is_alphabetic) && second.is_none_or(word);
         let near = repl::meant(first).filter(|_| command)?;
@@ -170,6 +219,19 @@ impl Prompt<'_> {
             Command::Plot => self.plot(rest)?,
             Command::Expect => return self.expect(rest),
             Command::Explain => self.explain(rest)?,
+            Command::Show => {
+                if rest.is_empty() {
+                    return Err("show what? `show f`, `show max(x)`".into());
+                }
+                match self.session.part_values(rest) {
+                    Some(values) => self.values(values?),
+                    None => {
+                        let value = self.session.value(rest)?;
+                        self.session.answer(&value);
+                        self.terminal.line(&plain(&value));
+                    }
+                }
+            }
             Command::Unit => self.unit(rest)?,
             Command::Doc => self.doc(rest)?,
             Command::Deps => self.deps(rest)?,
@@ -217,6 +279,8 @@ impl Prompt<'_> {
                 ("10 mm * 2 N/m", "its value, with its unit; `ans` is the last one"),
                 ("f = LuGre(vd = 10 mm/s)", "an instance of a model, of yours or of the library"),
                 ("f.Fs = 1 N", "sets a parameter, an input or a slot"),
+                ("x = 3 mm", "a variable: later lines may use it"),
+                ("f", "the values of an instance"),
                 ("model M { … }", "any item; a bracket that is open goes on on the next line"),
             ] {
                 self.terminal.line(&format!("  {example:width$}  {words}"));
@@ -408,10 +472,18 @@ impl Prompt<'_> {
             explanation.quantities.iter().filter(|q| q.kind != "let" && !q.path.contains('.')).collect();
         let width = shown.iter().map(|q| q.path.chars().count()).max().unwrap_or(0);
         let units = shown.iter().map(|q| q.unit.chars().count()).max().unwrap_or(0);
+        let default = |path: &str| {
+            let given = explanation.equations.iter().find(|(left, _)| {
+                left == path && explanation.quantities.iter().any(|q| q.path == path && q.kind == "param")
+            });
+            given.map_or(String::new(), |(_, value)| format!("= {value}"))
+        };
+        let defaults = shown.iter().map(|q| default(&q.path).chars().count()).max().unwrap_or(0);
         self.terminal.line("");
         for q in shown {
             let doc = q.doc.as_deref().unwrap_or_default().lines().next().unwrap_or_default();
-            let line = format!("  {:<6} {:width$}  {:units$}  {doc}", q.kind, q.path, q.unit);
+            let value = default(&q.path);
+            let line = format!("  {:<6} {:width$}  {:units$}  {value:defaults$}  {doc}", q.kind, q.path, q.unit);
             self.terminal.line(line.trim_end());
         }
         Ok(())
@@ -467,6 +539,9 @@ impl Prompt<'_> {
         for (name, instance) in &instances {
             self.terminal.line(&format!("{name} = {instance}"));
         }
+        for (name, text) in self.session.variables() {
+            self.terminal.line(&format!("{name} = {text}"));
+        }
         let (models, experiments) = (self.session.models(), self.session.experiments());
         if !models.is_empty() {
             self.terminal.line(&format!("models: {}", models.join(", ")));
@@ -506,6 +581,7 @@ impl Prompt<'_> {
                 what: file,
                 models: vec![what],
                 set: Vec::new(),
+                over: None,
                 out: None,
                 json: false,
                 figures: Default::default(),
@@ -514,6 +590,7 @@ impl Prompt<'_> {
                 what,
                 models: Vec::new(),
                 set: Vec::new(),
+                over: None,
                 out: None,
                 json: false,
                 figures: Default::default(),
@@ -537,7 +614,8 @@ impl Prompt<'_> {
         let stem = path.file_stem().map(|stem| stem.to_string_lossy().into_owned()).unwrap_or_default();
         let legal: String = stem.chars().map(|c| if c.is_ascii_alphanumeric() || c == '_' { c } else { '_' }).collect();
         let legal = if legal.starts_with(|c: char| c.is_ascii_alphabetic()) { legal } else { format!("s{legal}") };
-        let text = self.session.written(&legal.to_ascii_lowercase())?;
+        let folder = path.parent().unwrap_or(Path::new(""));
+        let text = self.session.written(&legal.to_ascii_lowercase(), folder)?;
         project::write(path, text.as_bytes()).map_err(|error| format!("cannot write {name}: {error}"))?;
         self.terminal.line(&format!("wrote {name}; `fric test {name}` runs it"));
         Ok(())

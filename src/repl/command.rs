@@ -17,6 +17,7 @@ pub const COMMANDS: &[(&str, &str, &str)] = &[
     ),
     ("expect", "expect max(x) < 1 mm", "checks the last run now; `save` writes it"),
     ("explain", "explain f.z | explain LuGre", "unit, range, equation, how it is stepped"),
+    ("show", "show f | show max(x)", "the values of an instance, or of an expression; its name alone does the same"),
     ("unit", "unit f.g", "the unit of a quantity or an expression"),
     ("doc", "doc LuGre", "ports, parameters and equations of a model"),
     ("deps", "deps f.F", "what a quantity needs, down to inputs and parameters"),
@@ -44,6 +45,7 @@ pub enum Command {
     Plot,
     Expect,
     Explain,
+    Show,
     Unit,
     Doc,
     Deps,
@@ -67,6 +69,7 @@ impl Command {
             "plot" => Command::Plot,
             "expect" => Command::Expect,
             "explain" => Command::Explain,
+            "show" => Command::Show,
             "unit" => Command::Unit,
             "doc" => Command::Doc,
             "deps" => Command::Deps,
@@ -119,6 +122,11 @@ pub fn read(line: &str) -> Line {
     }
     let Some(equals) = words.iter().position(|token| token.text(line) == "=") else { return Line::Expression };
     let path = &words[..equals];
+    // `for i = 1:3`: two words in a row are no path.
+    let apart = |pair: &[grammar::tokens::Token]| pair.iter().all(|token| token.kind == TokenKind::Word);
+    if path.windows(2).any(apart) {
+        return Line::Expression;
+    }
     let of_a_path = |at: usize| match path[at].kind {
         TokenKind::Word | TokenKind::Number => true,
         TokenKind::Symbol => matches!(path[at].text(line), "." | "[" | "]"),

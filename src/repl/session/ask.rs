@@ -15,7 +15,7 @@ use std::sync::Arc;
 impl Session {
     /// The present value of an expression.
     pub fn value(&mut self, text: &str) -> Result<Value, Fault> {
-        let text = self.with_answer(text)?;
+        let text = self.with_values(text)?;
         let what = self.meant(&text).unwrap_or(What::Session);
         let case = match self.now(&what, &[format!("plot {text}")], &text) {
             Err(Fault::Found(files, errors)) if errors.iter().any(|error| error.code == "E0901") => {
@@ -46,7 +46,7 @@ impl Session {
     /// A measure over the last run, such as `max(fr.F)`.
     pub(super) fn measured(&mut self, what: &What, text: &str) -> Option<Result<Value, Fault>> {
         self.setup(what).duration.or_else(|| matches!(what, What::Experiment(..)).then_some(1.0))?;
-        let setup = Setup { also: vec![format!("expect {text} ~= 0 +- inf")], ..self.setup(what).clone() };
+        let setup = Setup { also: vec![format!("show {text}")], ..self.setup(what).clone() };
         let (mut loaded, name) = self.loaded(what, "");
         let cases = self.compiled_in(&mut loaded, &name, &setup, &[], false);
         let (cases, _) = match cases {
@@ -63,12 +63,8 @@ impl Session {
         if let Some(problem) = &verdict.problem {
             return Some(Err(Fault::Words(problem.clone())));
         }
-        let value = match (&verdict.margin, verdict.readings.first()) {
-            (Some(margin), _) => (margin.value, margin.unit.clone()),
-            (None, Some(reading)) => (reading.value, reading.unit.clone()),
-            (None, None) => return None,
-        };
-        Some(Ok(Value { si: value.0, unit: value.1, boolean: false }))
+        let shown = verdict.shown.as_ref()?;
+        Some(Ok(Value { si: shown.value, unit: shown.unit.clone(), boolean: false }))
     }
 
     /// Stores a value for `ans`.
@@ -76,21 +72,73 @@ impl Session {
         self.ans = Some(value.clone());
     }
 
-    /// The text with `ans` replaced by the last value.
-    pub(super) fn with_answer(&self, text: &str) -> Result<String, Fault> {
+    /// The text with `ans` replaced by the last value, and variables by theirs. A quantity of the last run or of an
+    /// instance takes precedence over a variable of its name.
+    pub(super) fn with_values(&self, text: &str) -> Result<String, Fault> {
         let mut out = String::new();
         let mut after_dot = false;
-        for token in tokens(text) {
+        let all = tokens(text);
+        for (k, token) in all.iter().enumerate() {
             let word = token.text(text);
+            let next = all[k + 1..].iter().find(|token| !token.is_trivia()).map(|token| token.text(text));
+            // `x.y`, `x(…)`, and `x = …` of an argument name something else.
+            let named = after_dot || matches!(next, Some("." | "(" | "="));
+            let variable =
+                || self.variables.iter().find(|(name, ..)| name == word && self.quantities().all(|q| q.path != word));
             if token.kind == TokenKind::Word && word == "ans" && !after_dot {
                 let value = self.ans.as_ref().ok_or("there is no `ans` yet: it is the last value shown")?;
+                out += &literal(value);
+            } else if let (TokenKind::Word, false, Some((_, _, value))) = (token.kind, named, variable()) {
                 out += &literal(value);
             } else {
                 out += word;
             }
-            after_dot = word == ".";
+            after_dot = word == "." || (after_dot && token.is_trivia());
         }
         Ok(out)
+    }
+
+    /// `x = 3 mm`: a value with a name, for later lines.
+    pub fn set_variable(&mut self, name: &str, text: &str) -> Result<Value, Fault> {
+        let value = self.value(text)?;
+        self.variables.retain(|(other, ..)| other != name);
+        self.variables.push((name.into(), text.trim().into(), value.clone()));
+        Ok(value)
+    }
+
+    /// Variables, each with its value as typed.
+    pub fn variables(&self) -> impl Iterator<Item = (&str, &str)> {
+        self.variables.iter().map(|(name, text, _)| (name.as_str(), text.as_str()))
+    }
+
+    /// Whether a name is free for a variable: it is no quantity, instance or constant.
+    pub fn is_free(&self, name: &str) -> bool {
+        let part =
+            |path: &str| path == name || path.strip_prefix(name).is_some_and(|rest| rest.starts_with(['.', '[']));
+        !self.own_constant(name)
+            && self.quantities().all(|q| !part(&q.path))
+            && self.parts.iter().all(|p| p.name != name)
+    }
+
+    /// The quantities of an instance or a part with their present values; none if there is no part of this name.
+    pub fn part_values(&self, name: &str) -> Option<Result<Vec<(Listed, Value)>, Fault>> {
+        let what = self.meant(name).unwrap_or_else(|| self.current());
+        let prefix = format!("{name}.");
+        let known = self.setup(&what).known.clone();
+        let listed: Vec<Listed> = known.iter().filter(|q| q.path.starts_with(&prefix)).cloned().collect();
+        if listed.is_empty() || known.iter().any(|q| q.path == name) {
+            return None;
+        }
+        let paths: Vec<&str> = listed.iter().map(|q| q.path.as_str()).collect();
+        Some(self.now(&what, &[format!("plot {}", paths.join(", "))], name).map(|case| {
+            let series = case.experiment.plots.last().map_or(&[][..], |plot| &plot.series[..]);
+            let value = |series: &abi::plan::Series| Value {
+                si: case.instance.get(series.slot),
+                unit: series.unit.clone(),
+                boolean: series.boolean,
+            };
+            listed.into_iter().zip(series.iter().map(value)).collect()
+        }))
     }
 
     /// The dimension that fits in place of `?` in a line.

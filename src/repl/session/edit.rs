@@ -108,6 +108,7 @@ impl Session {
 
     /// Creates an instance, or replaces one: states continue, matched by name and unit. Returns a line about it.
     pub fn add_part(&mut self, name: &str, instance: &str) -> Result<String, Fault> {
+        let instance = self.with_values(instance)?;
         let instance =
             if instance.contains('(') { instance.trim().to_string() } else { format!("{}()", instance.trim()) };
         let mut next = self.clone();
@@ -170,6 +171,10 @@ impl Session {
 
     /// Sets a parameter, an input or a slot of an instance or of the last run.
     pub fn set(&mut self, path: &str, setting: &str) -> Result<(), Fault> {
+        let setting = &match setting.split_once('=') {
+            Some((left, value)) => format!("{left}={}", self.with_values(value)?),
+            None => setting.to_string(),
+        };
         let what = self.meant(path);
         let Some(what) = what else {
             let head = path.split('.').next().unwrap_or(path);

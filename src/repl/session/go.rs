@@ -113,7 +113,7 @@ impl Session {
         keep: bool,
         watch: &(dyn Fn(f64) -> Continue + Sync),
     ) -> Result<Ran, Fault> {
-        let statement = self.with_answer(statement)?;
+        let statement = self.with_values(statement)?;
         let what = self.meant(&statement).unwrap_or_else(|| self.current());
         let setup = self.setup(&what).clone();
         if setup.duration.is_none() && !matches!(what, What::Experiment(..)) {
@@ -209,6 +209,7 @@ impl Session {
             step: Some(h),
             duration: setup.duration,
             also: vec![format!("plot {}", paths.join(", "))],
+            any_step: true,
             unjudged: true,
             ..Changes::default()
         };
@@ -254,8 +255,15 @@ impl Session {
         steady: bool,
         watch: &mut dyn FnMut(f64) -> Continue,
     ) -> Result<Cut, Fault> {
+        let shows = &self.with_values(shows)?;
         let what = self.meant(path).unwrap_or_else(|| self.current());
-        let (first, last) = (self.value(from)?, self.value(to)?);
+        let (mut first, mut last) = (self.value(from)?, self.value(to)?);
+        // 0 fits every unit.
+        if first.si == 0.0 && first.unit.dimension.is_none() {
+            first.unit = last.unit.clone();
+        } else if last.si == 0.0 && last.unit.dimension.is_none() {
+            last.unit = first.unit.clone();
+        }
         if first.unit.dimension != last.unit.dimension {
             let (a, b) = (first.unit.dimension.describe(), last.unit.dimension.describe());
             return Err(Fault::Words(format!("from {a} to {b}: both ends are of one kind")));
@@ -297,7 +305,8 @@ impl Session {
                 )));
             }
         };
-        let unit = unit_as_typed(from).filter(|unit| unit.dimension == own.dimension);
+        let typed = unit_as_typed(from).or(unit_as_typed(to));
+        let unit = typed.filter(|unit| unit.dimension == own.dimension);
         let over = (path.to_string(), unit.unwrap_or(own));
         let changes = Changes {
             set: setup.set.clone(),

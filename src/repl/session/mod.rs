@@ -111,6 +111,8 @@ pub struct Session {
     /// Whether the previous line was about the instances.
     at_bench: bool,
     ans: Option<Value>,
+    /// `x = 3 mm`: the name, the value as typed, and the value.
+    variables: Vec<(String, String, Value)>,
 }
 
 /// Names that the compiler uses for typed texts.
@@ -252,6 +254,7 @@ impl Session {
             set: setup.set.clone(),
             also: setup.also.iter().chain(also).cloned().collect(),
             duration: setup.duration,
+            any_step: question,
             unjudged: question,
             ..Changes::default()
         };

@@ -6,10 +6,11 @@ use super::{Fault, MODEL, Session, What, found};
 use crate::compile::{self, Loaded};
 use grammar::ast::{self, Item};
 use grammar::diagnostic::Diagnostic;
+use std::path::{Component, Path, PathBuf};
 
 impl Session {
-    /// The session as a file: an experiment of this name.
-    pub fn written(&self, name: &str) -> Result<String, Fault> {
+    /// The session as a file in this folder: an experiment of this name.
+    pub fn written(&self, name: &str, folder: &Path) -> Result<String, Fault> {
         let what = self.current();
         let setup = self.setup(&what);
         let mut text = String::new();
@@ -28,7 +29,7 @@ impl Session {
             }
             What::Experiment(file, experiment) => {
                 match file {
-                    Some(file) => text += &format!("import \"{}\"\n", self.used[*file].path),
+                    Some(file) => text += &imports(&self.used[*file], folder),
                     None => text += &(self.items.join("\n") + "\n"),
                 }
                 let (loaded, _) = self.loaded(&what, "");
@@ -43,13 +44,46 @@ impl Session {
             text += &format!("  {line}\n");
         }
         text += "}\n";
-        let mut loaded = compile::load(name, &text, &crate::disk::Disk);
+        let place = folder.join(name).display().to_string();
+        let mut loaded = compile::load(&place, &text, &crate::disk::Disk);
         let diagnostics = compile::check(&mut loaded, &crate::disk::Disk);
         if diagnostics.iter().any(Diagnostic::is_error) {
             return Err(Fault::Found(loaded.files.0, diagnostics));
         }
         grammar::format::format(&text, 120).map_err(|errors| found(&loaded, &errors, "", None))
     }
+}
+
+/// Imports of a file in use and of what it imports itself, for a file in `folder`: imports reach one file far.
+fn imports(used: &super::Used, folder: &Path) -> String {
+    let from = |path: &Path| -> String {
+        match (path.is_absolute(), folder.as_os_str().is_empty() || folder == Path::new(".")) {
+            (true, _) | (_, true) => path.display().to_string(),
+            (false, false) if folder.is_absolute() || folder.components().any(|part| part == Component::ParentDir) => {
+                std::path::absolute(path).unwrap_or(path.to_path_buf()).display().to_string()
+            }
+            (false, false) => {
+                let up = folder.components().filter(|part| matches!(part, Component::Normal(_))).map(|_| "..");
+                up.collect::<PathBuf>().join(path).display().to_string()
+            }
+        }
+    };
+    let path = Path::new(&used.path);
+    let beside = path.parent().unwrap_or(Path::new(""));
+    let mut lines = vec![format!("import \"{}\"\n", from(path))];
+    let file = used.loaded.files.get(used.loaded.root());
+    for item in &file.ast.items {
+        let Item::Import(import) = item else { continue };
+        let text = used.loaded.files.slice(import.span).trim();
+        let line = match text.split_once('"') {
+            Some((_, rest)) => format!("import \"{}\"\n", from(&beside.join(rest.trim_end_matches('"')))),
+            None => format!("{text}\n"),
+        };
+        if !lines.contains(&line) {
+            lines.push(line);
+        }
+    }
+    lines.concat()
 }
 
 /// Statements of an experiment as written, with the duration replaced if one is given.
