@@ -280,7 +280,7 @@ impl Look {
 /// `fric run`
 #[derive(clap::Args, Debug)]
 pub struct Run {
-    /// The text to run
+    /// The text to run; `-` is the standard input
     #[arg(value_hint = ValueHint::FilePath)]
     pub file: PathBuf,
     /// Experiments in it; all if none is named
@@ -291,15 +291,18 @@ pub struct Run {
     /// Folder for a plot (SVG) and the data (CSV) of each experiment [default: out, unless --plot, --data or --json]
     #[arg(long, value_name = "DIR", value_hint = ValueHint::DirPath)]
     pub out: Option<PathBuf>,
-    /// Write the plot of one experiment to this file: .svg, .png or .pdf
+    /// Write the plot of one experiment to this file: .svg, .png or .pdf; `-` is the standard output
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath, value_parser = picture)]
     pub plot: Option<PathBuf>,
     /// How it is drawn
     #[command(flatten)]
     pub look: Look,
-    /// Write the data of one experiment, a row for each step: .csv, .parquet, .mat (MATLAB) or .npz (NumPy)
+    /// Write the data of one experiment, a row for each step: .csv, .parquet, .mat (MATLAB) or .npz (NumPy); `-` is the standard output, as CSV
     #[arg(long, alias = "csv", value_name = "FILE", value_hint = ValueHint::FilePath, value_parser = data)]
     pub data: Option<PathBuf>,
+    /// Show the plot that was written with the program that the desktop has for it
+    #[arg(long)]
+    pub open: bool,
     /// Interval between rows of the data, such as 1ms, instead of one row per step
     #[arg(long, value_name = "TIME", value_parser = positive_time)]
     pub every: Option<f64>,
@@ -357,9 +360,12 @@ pub struct Sweep {
     pub file: PathBuf,
     /// The experiment in it to run
     pub experiment: String,
-    /// What changes: 'fr.Fs = 1 N .. 2 N by 0.1 N', 'm = 1 kg, 2 kg', 'fr.vs ~ lognormal(1 mm/s, 0.2)', also normal, uniform
-    #[arg(long, value_name = "CHANGE", required = true, value_parser = vary::parse)]
+    /// What changes: 'fr.Fs = 1 N .. 2 N by 0.1 N', 'k = 1 N/m .. 100 N/m log 9', 'm = 1 kg, 2 kg', 'fr.vs ~ lognormal(1 mm/s, 0.2)', also normal, uniform
+    #[arg(long, value_name = "CHANGE", value_parser = vary::parse)]
     pub vary: Vec<Vary>,
+    /// Print the K best rows: '5 by rms(e)', '3 by greatest period(x)'; of distributions by the mean, or '5 by p95 rms(e)'
+    #[arg(long, value_name = "K by MEASURE", num_args = 1..=5)]
+    pub best: Vec<String>,
     /// Draws of the distributions, at each point of the grids [default: 100]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..=1_000_000_000))]
     pub runs: Option<u64>,
@@ -635,8 +641,9 @@ pub struct Explain {
     /// A code such as E0101, or a file
     #[arg(value_name = "CODE|FILE")]
     pub subject: String,
-    /// Models of the file to explain; all if none is named
-    pub models: Vec<String>,
+    /// Models, experiments or rigs of the file to explain; all models if none is named
+    #[arg(value_name = "NAME")]
+    pub names: Vec<String>,
     /// How long a fixed step takes on this machine: the worst of a million calls
     #[arg(long)]
     pub step: bool,
@@ -657,6 +664,9 @@ pub struct Characterise {
     /// Change a parameter: `Fs=2N`
     #[arg(long = "set", value_name = "NAME=VALUE", value_parser = setting)]
     pub set: Vec<(String, String)>,
+    /// The same model with several values of an input or a parameter, side by side: 'N = 5 N, 10 N, 50 N'
+    #[arg(long, value_name = "PATH = VALUES", value_parser = vary::parse)]
+    pub over: Option<Vary>,
     /// Folder for the report, the battery and the tables, also as LaTeX [default: out/MODEL]
     #[arg(long, value_name = "DIR", value_hint = ValueHint::DirPath)]
     pub out: Option<PathBuf>,
@@ -1095,6 +1105,7 @@ fn picture(text: &str) -> Result<PathBuf, String> {
     let path = PathBuf::from(text);
     match path.extension().and_then(|extension| extension.to_str()) {
         Some("svg" | "png" | "pdf") => Ok(path),
+        None if text == "-" => Ok(path),
         _ => Err("the name of a plot ends in .svg, .png or .pdf".into()),
     }
 }
@@ -1104,6 +1115,7 @@ fn data(text: &str) -> Result<PathBuf, String> {
     let path = PathBuf::from(text);
     match path.extension().and_then(|extension| extension.to_str()).map(str::to_ascii_lowercase).as_deref() {
         Some("csv" | "parquet" | "mat" | "npz") => Ok(path),
+        None if text == "-" => Ok(path),
         _ => Err("the name of the data ends in .csv, .parquet, .mat (MATLAB) or .npz (NumPy)".into()),
     }
 }

@@ -7,6 +7,7 @@ use std::fs;
 use std::io::{self, Write};
 use std::os::unix::fs::{DirBuilderExt, OpenOptionsExt};
 use std::path::{Component, Path, PathBuf};
+use std::sync::OnceLock;
 
 /// The library: dotted name of each file (`std.friction.lugre`) and its text, sorted by name.
 const LIBRARY: &[(&str, &str)] = include!(concat!(env!("OUT_DIR"), "/library.rs"));
@@ -19,11 +20,19 @@ pub fn library() -> &'static [(&'static str, &'static str)] {
 /// Longest accepted text; a longer file was not written by hand.
 const MOST_BYTES: u64 = 64 << 20;
 
-/// Reads a text.
+/// The name of the standard input, and of the standard output, in the place of a file.
+pub const STANDARD: &str = "-";
+
+/// Reads a text; `-` is the standard input.
 ///
 /// # Errors
 /// Why not, in words.
 pub fn read(path: &Path) -> Result<String, String> {
+    if path == Path::new(STANDARD) {
+        // It can be read once only.
+        static INPUT: OnceLock<Result<String, String>> = OnceLock::new();
+        return INPUT.get_or_init(read_input).clone();
+    }
     text(read_bytes(path)?)
 }
 

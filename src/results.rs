@@ -198,6 +198,67 @@ pub fn verdicts(
     out
 }
 
+/// The measures of all cases of a sweep as a table; empty for a single case, and if nothing is measured.
+pub fn cases(terminal: &Terminal, labels: &[&str], results: &[Result<Outcome, Failure>], indent: &str) -> String {
+    let mut titles: Vec<String> = Vec::new();
+    let read = |result: &Result<Outcome, Failure>| -> Vec<(String, String)> {
+        let verdicts = result.as_ref().map_or(&[][..], |outcome| &outcome.verdicts[..]);
+        let mut found: Vec<(String, String)> = Vec::new();
+        for verdict in verdicts {
+            let shown = verdict.shown.as_ref().filter(|_| verdict.readings.len() != 1);
+            let readings = verdict.readings.iter().chain(shown.map(|shown| shown as &Reading));
+            for reading in readings {
+                if found.iter().all(|(text, _)| *text != reading.text) {
+                    found.push((reading.text.clone(), show(reading.value, &reading.unit, 6)));
+                }
+            }
+        }
+        found
+    };
+    let rows: Vec<Vec<(String, String)>> = results.iter().map(read).collect();
+    for (title, _) in rows.iter().flatten() {
+        if !titles.contains(title) {
+            titles.push(title.clone());
+        }
+    }
+    if labels.len() < 2 || titles.is_empty() {
+        return String::new();
+    }
+    let judged = results.iter().flatten().flat_map(|outcome| &outcome.verdicts).any(|verdict| verdict.shown.is_none());
+    let mut table: Vec<Vec<String>> = vec![std::iter::once(String::new()).chain(titles.iter().cloned()).collect()];
+    for ((label, row), result) in labels.iter().zip(&rows).zip(results) {
+        let mut cells = vec![(*label).to_string()];
+        for title in &titles {
+            let cell = row.iter().find(|(text, _)| text == title);
+            cells.push(cell.map_or("-".into(), |(_, value)| value.clone()));
+        }
+        let own = result.as_ref().map_or(&[][..], |outcome| &outcome.verdicts[..]);
+        let own: Vec<&Verdict> = own.iter().filter(|verdict| verdict.shown.is_none()).collect();
+        if judged {
+            cells.push(match (result, own.iter().all(|verdict| verdict.passed())) {
+                (Err(_), _) => terminal.styled(Style::Bad, "stopped"),
+                (Ok(_), true) if own.is_empty() => "-".into(),
+                (Ok(_), true) => terminal.styled(Style::Good, "✓"),
+                (Ok(_), false) => terminal.styled(Style::Bad, "✗"),
+            });
+        }
+        table.push(cells);
+    }
+    let widths: Vec<usize> = (0..=titles.len())
+        .map(|k| table.iter().filter_map(|row| row.get(k)).map(|cell| cell.chars().count()).max().unwrap_or(0))
+        .collect();
+    let mut out = String::from("\n");
+    for row in &table {
+        let cells: Vec<String> = row
+            .iter()
+            .enumerate()
+            .map(|(k, cell)| widths.get(k).map_or(cell.clone(), |width| format!("{cell:width$}")))
+            .collect();
+        out += &format!("{indent}{}\n", cells.join("  ").trim_end());
+    }
+    out
+}
+
 /// The value with its error, the distance to the limit, and the time.
 fn words(verdict: &Verdict, estimate: Option<&Estimate>, digits: Option<u8>) -> String {
     if let Some(problem) = &verdict.problem {

@@ -63,11 +63,16 @@ impl Terminal {
 
     /// Prints to the standard output.
     pub fn print(&mut self, text: &str) {
+        self.bytes(text.as_bytes());
+    }
+
+    /// Writes the contents of a file to the standard output.
+    pub fn bytes(&mut self, bytes: &[u8]) {
         if self.closed {
             return;
         }
         let mut out = io::stdout().lock();
-        if let Err(error) = out.write_all(text.as_bytes()).and_then(|()| out.flush()) {
+        if let Err(error) = out.write_all(bytes).and_then(|()| out.flush()) {
             self.closed = true;
             // A full disk is reported, a closed pipe is not.
             if error.kind() != ErrorKind::BrokenPipe {

@@ -4,7 +4,7 @@
 //! a function of its number alone. Random numbers come from a counter-based generator, so a run has the same ones on
 //! every machine and in any order.
 
-use crate::compile::Alone;
+use crate::compile::{Alone, spaced};
 use crate::quantity;
 use abi::unit::Unit;
 
@@ -40,7 +40,7 @@ pub enum How {
 /// # Errors
 /// What is wrong with it, and how to write it.
 pub fn parse(text: &str) -> Result<Vary, String> {
-    const EXAMPLES: &str = "write it as `fr.Fs = 1 N .. 2 N by 0.1 N`, `fr.Fs = 1 N, 2 N`, \
+    const EXAMPLES: &str = "write it as `fr.Fs = 1 N .. 2 N by 0.1 N`, `fr.Fs = 1 N .. 100 N log 10`, `fr.Fs = 1 N, 2 N`, \
         or `fr.vs ~ normal(1 mm/s, 0.1 mm/s)`, lognormal(median, spread), uniform(from, to)";
     let split = text.find(['=', '~']).ok_or(EXAMPLES)?;
     let (path, rest) = (text[..split].trim(), text[split + 1..].trim());
@@ -56,6 +56,22 @@ fn listed(text: &str, examples: &str) -> Result<(Unit, How), String> {
         let (values, unit) = of_one_kind(&text.split(',').collect::<Vec<_>>())?;
         return Ok((unit, How::Values(values)));
     };
+    for (word, log) in [(" log ", true), (" lin ", false)] {
+        let Some((last, number)) = rest.split_once(word) else { continue };
+        let (values, unit) = of_one_kind(&[first, last])?;
+        let count = number.trim().parse::<usize>().ok().filter(|count| (2..=MOST_VALUES).contains(count));
+        let count = count.ok_or(format!("`{}` is no number of values: 2 to {MOST_VALUES}", number.trim()))?;
+        let [first, last] = [values[0], values[1]];
+        if log && !(first * last > 0.0) {
+            return Err("a logarithmic grid has ends of one sign, and neither is 0".into());
+        }
+        let rounded = |value: &f64| {
+            let shown: f64 = format!("{:.11e}", unit.from_si(*value)).parse().unwrap_or(f64::NAN);
+            quantity::si(shown, &unit)
+        };
+        let values = spaced(count, first, last, log).iter().map(rounded).collect();
+        return Ok((unit.clone(), How::Values(values)));
+    }
     let (last, step) = rest.split_once(" by ").ok_or(examples)?;
     let (values, unit) = of_one_kind(&[first, last, step])?;
     let [first, last, step] = [values[0], values[1], values[2]];
@@ -267,6 +283,11 @@ mod tests {
         let grid = parse("fr.Fs = 1 N .. 2 N by 0.1 N").unwrap();
         let How::Values(values) = &grid.how else { panic!("{grid:?}") };
         assert_eq!((grid.path.as_str(), values.len(), values[3], values[10]), ("fr.Fs", 11, 1.3, 2.0));
+        let How::Values(values) = parse("rate = 1 N/s .. 100 N/s log 5").unwrap().how else { panic!() };
+        let ratio = |k: usize| values[k + 1] / values[k];
+        assert_eq!((values.len(), values[0], values[2], values[4]), (5, 1.0, 10.0, 100.0));
+        assert!((0..4).all(|k| (ratio(k) / 10_f64.sqrt() - 1.0).abs() < 1e-10), "{values:?}");
+        assert_eq!(parse("k = 0 N/m .. 4 N/m lin 3").unwrap().how, How::Values(vec![0.0, 2.0, 4.0]));
         assert_eq!(parse("k=1 N/m, 2 N/m").unwrap().how, How::Values(vec![1.0, 2.0]));
         let vs = parse("fr.vs ~ lognormal(1 mm/s, 0.2)").unwrap();
         assert_eq!((vs.unit.text.as_str(), vs.how), ("mm/s", How::Lognormal(1e-3, 0.2)));
@@ -284,6 +305,8 @@ mod tests {
         assert!(told("m ~ gauss(1 kg, 1 kg)").contains("normal, lognormal, uniform"));
         assert!(told("m ~ lognormal(1 kg, 0.1 kg)").contains("such as 0.2"));
         assert!(told("m = 1 kg .. 2 kg by 1 ng").contains("too many"));
+        assert!(told("m = 0 kg .. 2 kg log 5").contains("neither is 0"));
+        assert!(told("m = 1 kg .. 2 kg log 1.5").contains("no number of values"));
     }
 
     #[test]

@@ -763,3 +763,133 @@ fn rows_of_a_csv_lie_on_a_grid() {
     let done = folder.run(&["run", "pull.fric", "holds", "--every", "1ms", "--json"]);
     assert_eq!(done.status.code(), Some(2), "{done:?}");
 }
+
+/// A spring pulled at a speed: its force is k vp t, so each measure of a case has a closed form.
+const SPRING: &str = r#"
+model Spring {
+  input  vp [m/s] = 0.1 m/s
+  param  k = 2 N/m  in > 0
+  state  x [m] = 0
+  dx/dt  = vp
+  output F [N] = k * x
+}
+"#;
+
+/// `run` refuses what `check` refuses, also for steps given by options; `explain` names the same largest step.
+#[test]
+fn run_refuses_an_unstable_step() {
+    let text = "model Decay { state x [m] = 1 m in -2 m .. 2 m  dx/dt = -x / 10 ms  output y [m] = x }\n\
+                experiment e { run Decay() for 1 s  solver euler step 30 ms  plot y }\n";
+    let folder = Folder::new("unstable").with("decay.fric", text);
+    folder.check(&["check", "decay.fric"], 1, "E0702");
+    folder.check(&["run", "decay.fric"], 1, "stable up to a step of 20 ms only");
+    assert!(folder.names("out").is_empty(), "nothing is written");
+    folder.check(&["run", "decay.fric", "--step", "10ms"], 0, "wrote");
+    let (_, said) = folder.check(&["run", "decay.fric", "--solver", "rk4", "--step", "50ms"], 1, "E0702");
+    assert!(said.contains("`--solver expo`") && said.contains("28 ms"), "{said}");
+    folder.check(&["explain", "decay.fric", "e"], 0, "euler 20 ms, rk4 28 ms, expo any, implicit any");
+    folder.check(&["explain", "decay.fric", "f"], 1, "no model, experiment or rig `f`");
+    folder.check(&["run", "decay.fric", "--step", "10ms", "--cross"], 0, "largest difference");
+}
+
+/// An expectation for one case of a sweep, a logarithmic grid, a window up to an event; the table of all cases.
+#[test]
+fn a_sweep_answers_its_question() {
+    let text = format!(
+        "{SPRING}experiment e {{\n  run    Spring() for 1 s\n  sweep  k = 1 N/m .. 100 N/m log 3\n\
+         \x20 expect max(F) ~= 1 N +- 1 % for k = 10 N/m\n  show   max(F) before first(x > 50 mm)\n}}\n"
+    );
+    let folder = Folder::new("cases").with("spring.fric", text);
+    let (out, _) = folder.check(&["run", "spring.fric", "--no-error"], 0, "k = 100 N/m");
+    let table: Vec<&str> = out.lines().skip_while(|line| !line.trim_start().starts_with("max(F)")).collect();
+    let of = |case: &str| {
+        let line = table.iter().find(|line| line.trim_start().starts_with(case)).unwrap_or_else(|| panic!("{out}"));
+        line[line.find(case).unwrap() + case.len()..].split_whitespace().collect::<Vec<_>>().join(" ")
+    };
+    // 50 mm are reached half-way; only the middle case is judged.
+    assert_eq!([of("k = 1 N/m"), of("k = 100 N/m")], ["50 mN -", "5 N -"].map(str::to_string), "{out}");
+    assert!(of("k = 10 N/m").ends_with('✓'), "{out}");
+
+    let vary = ["sweep", "spring.fric", "e", "--no-error", "--set", "k=3N/m", "--vary", "vp = 0.1 m/s .. 1 m/s lin 4"];
+    let (out, _) = folder.check(&vary, 0, "vp [m/s]");
+    assert!(
+        out.contains("run") && out.lines().any(|line| line.split_whitespace().take(3).eq(["3", "1", "0.15"])),
+        "{out}"
+    );
+    let best = ["sweep", "spring.fric", "e", "--no-error", "--set", "k=3N/m", "--vary", "vp = 0.1 m/s .. 1 m/s lin 4"];
+    let (out, _) =
+        folder.check(&[&best[..], &["--best", "2", "by", "greatest", "final(F) - 1 N"]].concat(), 0, "final(F) - 1 N");
+    let rows: Vec<Vec<&str>> = out.lines().map(|line| line.split_whitespace().collect()).collect();
+    let ranked: Vec<&str> =
+        rows.iter().filter(|row| row.len() > 3 && row[0].parse::<u32>().is_ok()).map(|row| row[0]).collect();
+    assert_eq!(ranked, ["3", "2"], "{out}");
+    folder.check(&[&best[..], &["--best", "2 by nonsense(F)"]].concat(), 1, "nonsense");
+    folder.check(&["sweep", "spring.fric", "e", "--no-error", "-q"], 0, "");
+    assert_eq!(
+        fs::read_to_string(folder.0.join("sweep.csv")).unwrap().lines().count(),
+        4,
+        "the experiment's own sweep"
+    );
+}
+
+/// Two expectations on one measure have one column; arithmetic over measures has one too.
+#[test]
+fn a_table_has_each_column_once() {
+    let text = format!(
+        "{SPRING}experiment e {{\n  run    Spring() for 1 s\n  expect max(F) > 0.1 N\n  expect max(F) < 1 N\n\
+         \x20 expect max(F) - min(F) < 0.5 N\n  expect max(F) < 0.15 N before 0.5 s\n}}\n"
+    );
+    let folder = Folder::new("columns").with("spring.fric", text);
+    folder.check(&["sweep", "spring.fric", "e", "--no-error", "-q", "--vary", "k = 1 N/m, 2 N/m"], 0, "");
+    let table = fs::read_to_string(folder.0.join("sweep.csv")).unwrap();
+    let head: Vec<&str> = table.lines().next().unwrap().split(',').collect();
+    let mut once = head.clone();
+    once.sort_unstable();
+    once.dedup();
+    assert_eq!(once.len(), head.len(), "{table}");
+    let at = |title: &str| head.iter().position(|one| *one == title).unwrap_or_else(|| panic!("no {title}: {table}"));
+    let row: Vec<&str> = table.lines().nth(2).unwrap().split(',').collect();
+    assert_eq!((row[at("max(F) [N]")], row[at("max(F) - min(F) [N]")]), ("0.2", "0.2"), "{table}");
+    assert_eq!(row[at("max(F) before 0.5 s [N]")], "0.1", "{table}");
+}
+
+#[test]
+fn texts_come_from_a_pipe_and_pictures_go_into_one() {
+    let folder = Folder::new("pipes");
+    let piped = |args: &[&str], text: &str| {
+        let mut child =
+            folder.fric(args).stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+        child.stdin.take().unwrap().write_all(text.as_bytes()).unwrap();
+        child.wait_with_output().unwrap()
+    };
+    let picture = piped(&["run", "-", "silent", "--plot", "-"], PULL);
+    let svg = String::from_utf8(picture.stdout).unwrap();
+    assert!(picture.status.success() && svg.starts_with("<svg") && svg.trim_end().ends_with("</svg>"), "{svg}");
+    let table = piped(&["run", "-", "silent", "--csv", "-"], PULL);
+    assert!(String::from_utf8(table.stdout).unwrap().starts_with("t [s],x [mm]\n"));
+    let failing = piped(&["run", "-", "breaks", "--csv", "-"], PULL);
+    assert_eq!(failing.status.code(), Some(1), "nothing to write");
+    let both = piped(&["run", "-", "silent", "--csv", "-", "--plot", "-"], PULL);
+    assert_eq!(both.status.code(), Some(2));
+    let checked = piped(&["check", "-"], "const a = 1 N + 1 m\n");
+    assert_eq!(checked.status.code(), Some(1));
+    assert!(String::from_utf8(checked.stdout).unwrap().contains("E0101"));
+    assert!(folder.names("out").is_empty());
+}
+
+#[test]
+fn a_plot_is_opened_by_the_program_of_the_desktop() {
+    use std::os::unix::fs::PermissionsExt;
+    let folder = Folder::new("open").with("pull.fric", PULL).with("show", "#!/bin/sh\necho \"$1\" > shown\n");
+    let opener = folder.0.join("show");
+    fs::set_permissions(&opener, fs::Permissions::from_mode(0o755)).unwrap();
+    // The program is not waited for; it writes into a pipe, whose reading waits for it.
+    let made = Command::new("mkfifo").arg(folder.0.join("shown")).status().unwrap();
+    assert!(made.success());
+    let run = folder.fric(&["run", "pull.fric", "silent", "--open"]).env("FRIC_OPENER", &opener).output().unwrap();
+    assert!(run.status.success());
+    assert_eq!(fs::read_to_string(folder.0.join("shown")).unwrap(), "out/silent.svg\n");
+    let missing =
+        folder.fric(&["run", "pull.fric", "silent", "--open"]).env("FRIC_OPENER", "no-such-program").output().unwrap();
+    assert!(missing.status.success() && String::from_utf8_lossy(&missing.stderr).contains("FRIC_OPENER"));
+}

@@ -3,6 +3,7 @@
 use super::{Done, End, compiled, done_beside, has_experiment, load, sound};
 use crate::args::{self, Run};
 use crate::commands::shared::cross_check::{Crossed, cross};
+use crate::commands::shared::open::open;
 use crate::compile::{Case, Loaded, Options, Stages, Stopwatch};
 use crate::figure::{self, Kept, Recorded};
 use crate::plot::{self, Figure, Kind};
@@ -29,6 +30,12 @@ pub fn run(args: &Run, timings: &mut Timings, terminal: &mut Terminal) -> End {
             return End::Failed;
         }
     };
+    let standard = [("--plot", &args.plot), ("--data", &args.data)]
+        .map(|(option, file)| file.as_deref().filter(|file| *file == Path::new(project::STANDARD)).map(|_| option));
+    if let ([Some(_), Some(_)], _) | ([Some(_), _] | [_, Some(_)], true) = (standard, args.json) {
+        terminal.error("only one of --plot -, --data - and --json can have the standard output");
+        return End::Misused;
+    }
     if names.len() > 1 && args.data.is_some() {
         terminal.error(&format!(
             "--data is for one experiment, and this runs {}: name one, or use --out DIR",
@@ -111,7 +118,9 @@ fn experiment(
     terminal: &mut Terminal,
 ) -> End {
     let file = args.file.display().to_string();
-    let talking = !args.json && !args.quiet;
+    let standard = |file: &Option<PathBuf>| file.as_deref() == Some(Path::new(project::STANDARD));
+    let to_output = standard(&args.plot) || standard(&args.data);
+    let talking = !args.json && !args.quiet && !to_output;
     let (cases, stages) = match compiled(loaded, name, options, before, talking, terminal) {
         Ok(compiled) => compiled,
         Err(diagnostics) => {
@@ -215,7 +224,7 @@ fn experiment(
     if talking {
         tell(&done, drawn.as_ref(), args.trust.digits, terminal);
         crossed.iter().for_each(|crossed| terminal.print(&crossed.words(terminal, "  ")));
-    } else if args.quiet {
+    } else if args.quiet || to_output {
         complain(name, &done, args.trust.digits, terminal);
         for crossed in crossed.iter().filter(|crossed| !crossed.passed()) {
             terminal.report(&crossed.words(terminal, "  "));
@@ -228,7 +237,14 @@ fn experiment(
         }
     }
     match written {
-        Ok(written) => {
+        Ok((written, output)) => {
+            terminal.bytes(&output);
+            if args.open {
+                match shown_picture(args, name, picture) {
+                    Some(picture) => open(&picture, terminal),
+                    None => terminal.report("--open: no plot was written to a file\n"),
+                }
+            }
             if talking && !written.is_empty() {
                 terminal.line(&format!("  wrote {}\n", written.join(", ")));
             }
@@ -258,10 +274,18 @@ fn drawn(name: &str, cases: &[Case], recorded: &[Recorded], look: &args::Look) -
     Some(look.titled(figure::figure(name, &subtitle, 0, recorded)))
 }
 
+/// The picture that was written to a file.
+fn shown_picture(args: &Run, name: &str, picture: Option<&PathBuf>) -> Option<PathBuf> {
+    let by_default = args.plot.is_none() && args.data.is_none() && !args.json;
+    let folder = args.out.clone().or(by_default.then(|| PathBuf::from("out")));
+    let own = picture.filter(|path| path.as_path() != Path::new(project::STANDARD)).cloned();
+    own.or(folder.map(|folder| folder.join(format!("{name}.svg")))).filter(|path| path.is_file())
+}
+
 /// Most rows of the data that the default folder gets without being asked.
 const UNASKED_ROWS: u64 = 100_000;
 
-/// Writes the requested files; returns their paths and remarks, or the one that failed and why. `grids`: the instants of
+/// Writes the requested files; returns their paths and remarks and what goes to the standard output, or the one that failed and why. `grids`: the instants of
 /// each case in s, if rows are requested on a time grid.
 fn write(
     args: &Run,
@@ -271,18 +295,23 @@ fn write(
     grids: &[Vec<f64>],
     drawn: Option<&Figure>,
     picture: Option<&PathBuf>,
-) -> Result<Vec<String>, (PathBuf, String)> {
+) -> Result<(Vec<String>, Vec<u8>), (PathBuf, String)> {
     let by_default = args.plot.is_none() && args.data.is_none() && !args.json;
     let folder = args.out.clone().or(by_default.then(|| PathBuf::from("out")));
-    let mut written = Vec::new();
-    let Some(figure) = drawn else { return Ok(written) };
-    let put = |path: &Path, bytes: &[u8]| {
+    let (mut written, mut output) = (Vec::new(), Vec::new());
+    let Some(figure) = drawn else { return Ok((written, output)) };
+    let mut put = |path: &Path, bytes: &[u8], remark: &str| {
+        if path == Path::new(project::STANDARD) {
+            output.extend_from_slice(bytes);
+            return Ok(());
+        }
         project::write(path, bytes).map_err(|error| (path.to_path_buf(), error.to_string()))?;
-        Ok(path.display().to_string())
+        written.push(format!("{}{remark}", path.display()));
+        Ok(())
     };
     for path in folder.iter().map(|folder| folder.join(format!("{name}.svg"))).chain(picture.cloned()) {
         let bytes = plot::picture(figure, &args.look.look(), Kind::of(&path).unwrap_or(Kind::Svg));
-        written.push(put(&path, &bytes)?);
+        put(&path, &bytes, "")?;
     }
     let tables: Vec<PathBuf> =
         folder.iter().map(|folder| folder.join(format!("{name}.csv"))).chain(args.data.clone()).collect();
@@ -298,10 +327,10 @@ fn write(
             let path = for_case(path, label);
             let format = Format::of(&path).unwrap_or(Format::Csv);
             let bytes = recording_files::bytes(&rows, format).map_err(|error| (path.clone(), error.to_string()))?;
-            written.push(put(&path, &bytes)? + &remark);
+            put(&path, &bytes, &remark)?;
         }
     }
-    Ok(written)
+    Ok((written, output))
 }
 
 /// The rows of the data of a case: every step, unless something else is requested; and a remark if some are left out.
@@ -353,6 +382,9 @@ fn for_case(path: &Path, label: &str) -> PathBuf {
     if words.is_empty() {
         return path.to_path_buf();
     }
+    if path == Path::new(project::STANDARD) {
+        return path.to_path_buf();
+    }
     let stem = path.file_stem().map(|stem| stem.to_string_lossy().into_owned()).unwrap_or_default();
     let extension = path.extension().map(|extension| extension.to_string_lossy().into_owned()).unwrap_or_default();
     path.with_file_name(format!("{stem}-{}.{extension}", words.join("-")))
@@ -380,6 +412,8 @@ fn tell(done: &Done, drawn: Option<&Figure>, digits: Option<u8>, terminal: &mut 
         }
         terminal.print(&results::verdicts(terminal, &outcome.verdicts, outcome.estimate.as_ref(), digits, "  "));
     }
+    let labels: Vec<&str> = done.cases.iter().map(|case| case.label.as_str()).collect();
+    terminal.print(&results::cases(terminal, &labels, &done.results, "  "));
 }
 
 /// Prints failed and undecided expectations to the standard error.

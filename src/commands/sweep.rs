@@ -5,9 +5,11 @@
 //! request, so that it cannot be resumed with another sweep or from damaged rows. After completion, [`errors`]
 //! estimates the numerical errors of a sample of its runs.
 
+mod best;
 mod errors;
 mod summary;
 
+use self::best::Best;
 use super::shared::progress;
 use super::{End, has_experiment, load, reported};
 use crate::args::Sweep;
@@ -19,7 +21,8 @@ use crate::terminal::{Style, Terminal};
 use crate::unfinished::{Hash, Mark, Unfinished};
 use crate::vary::{Dice, Vary};
 use crate::{project, results};
-use abi::plan::{Formula, Measure};
+use abi::plan::{Expect, Formula, Measure};
+use abi::unit::Unit;
 use abi::{Description, Slot};
 use runtime::engine::lanes::{self, Next};
 use runtime::engine::sweep::{self, Desk, Ticket};
@@ -53,8 +56,22 @@ pub fn sweep(args: &Sweep, terminal: &mut Terminal) -> End {
             return End::Misused;
         }
     }
-    let Some(cases) = compiled(args, &mut loaded, terminal) else { return End::Failed };
-    let table = match Table::new(args, cases) {
+    let best = match best::read(&args.best) {
+        Ok(best) => best,
+        Err(message) => {
+            terminal.error(&message);
+            return End::Misused;
+        }
+    };
+    let Some(cases) = compiled(args, best.as_ref(), &mut loaded, terminal) else { return End::Failed };
+    if args.vary.is_empty() && cases.len() == 1 {
+        terminal.error(&format!(
+            "nothing varies: add --vary 'PATH = 1 N .. 2 N by 0.1 N', or a `sweep` to `{}`",
+            args.experiment
+        ));
+        return End::Misused;
+    }
+    let table = match Table::new(args, cases, best) {
         Ok(table) => table,
         Err(message) => {
             terminal.error(&message);
@@ -72,9 +89,15 @@ pub fn sweep(args: &Sweep, terminal: &mut Terminal) -> End {
 
 /// The experiment with its parameters variable; a parameter that is computed from others, or has no value, is assigned
 /// one first.
-fn compiled(args: &Sweep, loaded: &mut Loaded, terminal: &Terminal) -> Option<Vec<Varying>> {
+fn compiled(args: &Sweep, best: Option<&Best>, loaded: &mut Loaded, terminal: &Terminal) -> Option<Vec<Varying>> {
+    // What rows are ranked by need not occur in the experiment.
+    let also = best.and_then(|best| best.measure.as_ref()).map(|measure| format!("show {measure}"));
     let mut options = Options {
-        changes: Changes { vary: args.vary.iter().map(|vary| vary.path.clone()).collect(), ..args.changed.changes() },
+        changes: Changes {
+            vary: args.vary.iter().map(|vary| vary.path.clone()).collect(),
+            also: also.into_iter().collect(),
+            ..args.changed.changes()
+        },
         interpret: args.interpret,
     };
     let name = &args.experiment;
@@ -122,6 +145,8 @@ struct Table {
     draws: u64,
     seed: u64,
     columns: Vec<Column>,
+    /// The ranking of rows, with the column that ranks them.
+    best: Option<(Best, usize)>,
 }
 
 /// The file to which rows are appended, and its checkpoint.
@@ -147,6 +172,19 @@ struct Column {
     /// Its axis in a figure.
     axis: Axis,
     kind: ColumnKind,
+    /// For a measure, a value or a verdict: what it is of.
+    of: Of,
+}
+
+/// What a column shows of the expectations of a run. Cases may have different expectations, so it is found by its text.
+#[derive(Clone, PartialEq, Default)]
+struct Of {
+    /// The expectation, of a value or a verdict.
+    expect: String,
+    /// The measure as written.
+    measure: String,
+    /// The window of the expectation in s; infinite to the end of the run.
+    window: (f64, f64),
 }
 
 #[derive(Clone, Copy, PartialEq, Eq)]
@@ -154,13 +192,36 @@ enum ColumnKind {
     Run,
     Case,
     Varied,
-    Measure(usize, usize),
-    Verdict(usize),
+    /// A measure, or arithmetic over measures.
+    Measure,
+    Value,
+    Verdict,
     Status,
 }
 
+impl ColumnKind {
+    /// Whether its cells are numbers that a run yields.
+    fn is_measured(self) -> bool {
+        matches!(self, ColumnKind::Measure | ColumnKind::Value)
+    }
+}
+
+/// What a run yields for one expectation.
+struct Yield {
+    /// Each measure and its value in its unit.
+    readings: Vec<(String, f64)>,
+    /// The value of the left side, in the unit of the column.
+    value: Option<f64>,
+    holds: bool,
+}
+
+/// The window of an expectation in s, infinite to the end of the run.
+fn window(expect: &Expect, duration: f64) -> (f64, f64) {
+    (expect.after, if expect.before >= duration { f64::INFINITY } else { expect.before })
+}
+
 impl Table {
-    fn new(args: &Sweep, cases: Vec<Varying>) -> Result<Table, String> {
+    fn new(args: &Sweep, cases: Vec<Varying>, best: Option<Best>) -> Result<Table, String> {
         let mut slots = Vec::new();
         for case in &cases {
             let mut of_case = Vec::new();
@@ -189,7 +250,14 @@ impl Table {
             }
         };
         let columns = columns(&cases, &args.vary);
-        Ok(Table { cases, vary: args.vary.clone(), slots, grid, draws, seed: args.seed, columns })
+        let best = match best {
+            Some(best) => {
+                let column = best.column(&columns)?;
+                Some((best, column))
+            }
+            None => None,
+        };
+        Ok(Table { cases, vary: args.vary.clone(), slots, grid, draws, seed: args.seed, columns, best })
     }
 
     fn total(&self) -> u64 {
@@ -285,7 +353,7 @@ impl Table {
         let description = |fitted: &PreparedRun| fitted.instance.description().clone();
         match self.cases[at].fit(&given) {
             Ok(fitted) => Ok((Run { number, at, values, description: description(&fitted) }, fitted)),
-            Err(broken) => Err(self.cells(number, at, &values, &[], &[], &format!("not run: {broken}"))),
+            Err(broken) => Err(self.cells(number, at, &values, &[], &format!("not run: {broken}"))),
         }
     }
 
@@ -293,8 +361,7 @@ impl Table {
     fn row(&self, run: Run, result: Result<Outcome, Failure>) -> Option<Vec<u8>> {
         let Run { number, at, values, description } = run;
         let case = &self.cases[at];
-        let mut readings: Vec<Vec<(String, f64)>> = Vec::new();
-        let mut verdicts = Vec::new();
+        let mut yields: Vec<Yield> = Vec::new();
         let status = match result {
             Err(failure) if failure.cause == Cause::Stopped => return None,
             Err(failure) => format!("stopped: {failure}"),
@@ -303,8 +370,13 @@ impl Table {
                 let extremes: Vec<(f64, f64)> = watched.iter().map(extremes).collect();
                 for verdict in own {
                     let read = |r: &runtime::run::verdict::Reading| (r.text.clone(), r.unit.from_si(r.value));
-                    readings.push(verdict.readings.iter().map(read).collect());
-                    verdicts.push(verdict.holds);
+                    let shown = verdict.shown.as_ref().map(|shown| shown.unit.from_si(shown.value));
+                    let compared = verdict.margin.as_ref().map(|margin| margin.unit.from_si(margin.value));
+                    yields.push(Yield {
+                        readings: verdict.readings.iter().map(read).collect(),
+                        value: shown.or(compared),
+                        holds: verdict.holds,
+                    });
                 }
                 let problem = own.iter().find_map(|verdict| verdict.problem.clone());
                 match (case.left(&description, &extremes), problem) {
@@ -314,20 +386,15 @@ impl Table {
                 }
             }
         };
-        Some(self.cells(number, at, &values, &readings, &verdicts, &status))
+        Some(self.cells(number, at, &values, &yields, &status))
     }
 
     /// A row.
-    fn cells(
-        &self,
-        run: u64,
-        at: usize,
-        values: &[f64],
-        readings: &[Vec<(String, f64)>],
-        verdicts: &[bool],
-        status: &str,
-    ) -> Vec<u8> {
+    fn cells(&self, run: u64, at: usize, values: &[f64], yields: &[Yield], status: &str) -> Vec<u8> {
         let case = &self.cases[at];
+        let duration = case.experiment.duration;
+        let expects = || case.experiment.expects[..case.expects()].iter().zip(yields);
+        let number = |value: Option<f64>| value.map_or(String::new(), abi::format::plain);
         let cell = |column: &Column| match column.kind {
             ColumnKind::Run => run.to_string(),
             ColumnKind::Case => case.label.clone(),
@@ -335,13 +402,19 @@ impl Table {
                 let k = self.vary.iter().position(|vary| vary.path == column.axis.name).expect("it is varied");
                 abi::format::plain(self.vary[k].unit.from_si(values[k]))
             }
-            ColumnKind::Measure(k, j) => {
-                // For an expectation that could not be evaluated, some measures may be missing.
-                let text = &case.experiment.expects[k].measures[j].text;
-                let found = readings.get(k).and_then(|read| read.iter().find(|(known, _)| known == text));
-                found.map_or(String::new(), |(_, value)| abi::format::plain(*value))
+            // For an expectation that could not be evaluated, some measures may be missing; for one of another case, all.
+            ColumnKind::Measure => number(expects().find_map(|(expect, found)| {
+                let known = window(expect, duration) == column.of.window;
+                let read = |read: &&(String, f64)| known && read.0 == column.of.measure;
+                found.readings.iter().find(read).map(|(_, value)| *value)
+            })),
+            ColumnKind::Value => {
+                number(expects().find_map(|(expect, found)| found.value.filter(|_| expect.text == column.of.expect)))
             }
-            ColumnKind::Verdict(k) => verdicts.get(k).map_or(String::new(), bool::to_string),
+            ColumnKind::Verdict => {
+                let found = expects().find(|(expect, _)| expect.text == column.of.expect);
+                found.map_or(String::new(), |(_, found)| found.holds.to_string())
+            }
             ColumnKind::Status => status.split_whitespace().collect::<Vec<_>>().join(" "),
         };
         line(self.columns.iter().map(cell))
@@ -450,7 +523,7 @@ impl Table {
             for note in self.cases.iter().flat_map(|case| &case.notes) {
                 terminal.line(&format!("  note: {note}"));
             }
-            terminal.print(&summary.words());
+            terminal.print(&summary.words(self));
             if !args.no_error {
                 match self.errors(&range, threads, &dice, &stopped) {
                     Some(errors) => terminal.print(&errors.words()),
@@ -488,8 +561,8 @@ impl Table {
             ColumnKind::Varied => {
                 varied.next().is_some_and(|(vary, value)| cell == abi::format::plain(vary.unit.from_si(*value)))
             }
-            ColumnKind::Measure(..) => cell.is_empty() || cell.parse::<f64>().is_ok(),
-            ColumnKind::Verdict(_) => matches!(cell, "" | "true" | "false"),
+            ColumnKind::Measure | ColumnKind::Value => cell.is_empty() || cell.parse::<f64>().is_ok(),
+            ColumnKind::Verdict => matches!(cell, "" | "true" | "false"),
             ColumnKind::Status => !cell.is_empty(),
         })
     }
@@ -572,8 +645,8 @@ impl Table {
         let holds = |column: &Column| match column.kind {
             ColumnKind::Run => Holds::Integers,
             ColumnKind::Case | ColumnKind::Status => Holds::Words,
-            ColumnKind::Varied | ColumnKind::Measure(..) => Holds::Numbers,
-            ColumnKind::Verdict(_) => Holds::Booleans,
+            ColumnKind::Varied | ColumnKind::Measure | ColumnKind::Value => Holds::Numbers,
+            ColumnKind::Verdict => Holds::Booleans,
         };
         let columns: Vec<(String, Holds)> =
             self.columns.iter().map(|column| (column.title.clone(), holds(column))).collect();
@@ -609,27 +682,82 @@ fn extremes(watched: &Verdict) -> (f64, f64) {
 }
 
 fn columns(cases: &[Varying], vary: &[Vary]) -> Vec<Column> {
-    let plain = |title: &str, kind| Column { title: title.into(), axis: Axis::default(), kind };
+    let plain = |title: &str, kind| Column { title: title.into(), axis: Axis::default(), kind, of: Of::default() };
     let mut columns = vec![plain("run", ColumnKind::Run)];
     if cases.len() > 1 {
         columns.push(plain("case", ColumnKind::Case));
     }
-    for vary in vary {
-        let axis = Axis { name: vary.path.clone(), unit: vary.unit.text.clone(), ..Axis::default() };
-        columns.push(Column { title: axis.title(), axis, kind: ColumnKind::Varied });
-    }
-    let first = &cases[0];
-    for (k, expect) in first.experiment.expects[..first.expects()].iter().enumerate() {
-        for (j, Measure { text, unit, .. }) in expect.measures.iter().enumerate() {
-            let axis = Axis { name: text.clone(), unit: unit.text.clone(), ..Axis::default() };
-            columns.push(Column { title: axis.title(), axis, kind: ColumnKind::Measure(k, j) });
+    let titled = |name: &str, unit: &Unit, kind, of| {
+        let axis = Axis { name: name.into(), unit: unit.text.clone(), ..Axis::default() };
+        Column { title: axis.title(), axis, kind, of }
+    };
+    columns.extend(vary.iter().map(|vary| titled(&vary.path, &vary.unit, ColumnKind::Varied, Of::default())));
+    let all = || cases.iter().flat_map(|case| case.experiment.expects[..case.expects()].iter().map(move |e| (case, e)));
+    // The same measure in windows of two expectations is two columns.
+    let windows = |text: &str| {
+        let mut found: Vec<(f64, f64)> = Vec::new();
+        for (case, expect) in all().filter(|(_, expect)| expect.measures.iter().any(|measure| measure.text == text)) {
+            let window = window(expect, case.experiment.duration);
+            found.extend((!found.contains(&window)).then_some(window));
         }
-        if !matches!(expect.condition, Formula::Shown(..)) {
-            columns.push(plain(&expect.text, ColumnKind::Verdict(k)));
+        found.len()
+    };
+    let known =
+        |columns: &[Column], kind, of: &Of| columns.iter().any(|column| column.kind == kind && column.of == *of);
+    for (case, expect) in all() {
+        let window = window(expect, case.experiment.duration);
+        for Measure { text, unit, .. } in &expect.measures {
+            let of = Of { expect: String::new(), measure: text.clone(), window };
+            if known(&columns, ColumnKind::Measure, &of) {
+                continue;
+            }
+            let mut name = text.clone();
+            if windows(text) > 1 {
+                name += &if window.0 > 0.0 { format!(" after {} s", window.0) } else { String::new() };
+                name += &if window.1.is_finite() { format!(" before {} s", window.1) } else { String::new() };
+            }
+            columns.push(titled(&name, unit, ColumnKind::Measure, of));
+        }
+        let of = Of { expect: expect.text.clone(), measure: String::new(), window };
+        if let Some((left, unit)) = left_side(expect)
+            && !known(&columns, ColumnKind::Value, &of)
+            && columns.iter().all(|column| column.axis.name != left)
+        {
+            columns.push(titled(&left, &unit, ColumnKind::Value, of.clone()));
+        }
+        if !matches!(expect.condition, Formula::Shown(..)) && !known(&columns, ColumnKind::Verdict, &of) {
+            columns.push(Column { of, ..plain(&expect.text, ColumnKind::Verdict) });
         }
     }
     columns.push(plain("status", ColumnKind::Status));
     columns
+}
+
+/// The left side of an expectation, or what is shown, as text with its unit; none for a measure alone, which has a column.
+fn left_side(expect: &Expect) -> Option<(String, Unit)> {
+    let text = expect.text.trim();
+    let (unit, left, text) = match &expect.condition {
+        Formula::Shown(unit, value) => {
+            let window = text.find(" after ").or(text.find(" before ")).unwrap_or(text.len());
+            let shown = text[..window].trim_end();
+            (unit, &**value, shown.rsplit_once(" [").map_or(shown, |(left, _)| left))
+        }
+        Formula::In(unit, comparison) => {
+            let left = match &**comparison {
+                Formula::Less(a, _)
+                | Formula::LessEqual(a, _)
+                | Formula::Greater(a, _)
+                | Formula::GreaterEqual(a, _) => a,
+                Formula::Near { value, .. } => value,
+                _ => return None,
+            };
+            let sign = text.find(['<', '>', '~', '=']).unwrap_or(text.len());
+            (unit, &**left, &text[..sign])
+        }
+        _ => return None,
+    };
+    let plain = matches!(left, Formula::Measure(_) | Formula::Number(_));
+    (!plain).then(|| (text.trim().to_string(), unit.clone()))
 }
 
 /// A row of the file.

@@ -1,7 +1,8 @@
 //! Code shared by several commands: sessions with files under change, the comparison of two solvers, packages of rigs,
-//! progress bars.
+//! progress bars, `--open`.
 
 pub mod cross_check;
 pub mod package;
 pub mod progress;
 pub mod session;
+pub mod open;

@@ -61,14 +61,19 @@ impl Table {
     ) -> Option<Errors> {
         let numbers: Vec<u64> = sample(self.total()).into_iter().filter(|number| range.contains(number)).collect();
         let own = |at: usize| &self.cases[at].experiment.expects[..self.cases[at].expects()];
-        let measures = own(0).iter().flat_map(|expect| &expect.measures);
+        let mut measures: Vec<(String, Unit, Option<Worst>)> = Vec::new();
+        for measure in (0..self.cases.len()).flat_map(own).flat_map(|expect| &expect.measures) {
+            if measures.iter().all(|(text, ..)| *text != measure.text) {
+                measures.push((measure.text.clone(), measure.unit.clone(), None));
+            }
+        }
         let mut errors = Errors {
             sampled: numbers.len() as u64,
             ended: 0,
             total: range.end - range.start,
             experiment: self.cases[0].experiment.clone(),
             companions: Vec::new(),
-            measures: measures.map(|measure| (measure.text.clone(), measure.unit.clone(), None)).collect(),
+            measures,
             verdicts: 0,
             open: Vec::new(),
         };
@@ -123,10 +128,10 @@ impl Errors {
         if self.companions.is_empty() {
             self.companions = companions;
         }
-        let mut measures = self.measures.iter_mut();
         for (expect, verdict) in expects.iter().zip(verdicts) {
             for measure in &expect.measures {
-                let (_, _, worst) = measures.next().expect("all cases have the same measures");
+                let known = self.measures.iter_mut().find(|(text, ..)| *text == measure.text);
+                let (_, _, worst) = known.expect("all measures are listed");
                 let read = verdict.readings.iter().find(|reading| reading.text == measure.text);
                 let Some(error) = read.and_then(|reading| reading.error) else { continue };
                 // If several are equally large, keep the first.
