@@ -98,7 +98,7 @@ fn library() {
         println!("  {what:<62} {:6.1} ms", median(&mut times));
     };
     let checked = |loaded: &compiler::Loaded| {
-        let found = compiler::check_models(loaded, &NoSources);
+        let found = compiler::check_declarations(loaded, &NoSources);
         assert!(found.iter().all(|found| !found.is_error()), "{found:?}");
     };
     let built = |mut loaded: compiler::Loaded, work: &dyn Fn(&compiler::ir::program::Program)| {
@@ -145,7 +145,7 @@ fn library() {
     timed("checked text by text, each with what it imports read anew", 5, &|| {
         for (name, text) in &texts {
             let loaded = load(name, text, &project::Disk);
-            black_box(compiler::check_models(&loaded, &project::Disk));
+            black_box(compiler::check_declarations(&loaded, &project::Disk));
         }
     });
     timed("the same with experiments and the physics of friction", 5, &|| {

@@ -41,8 +41,12 @@ fn main() {
 /// The output of each back end for a model; or the code of the first error, as for a model with an open slot.
 fn made(name: &str, text: &str, model: &str, method: Method) -> Result<Vec<Vec<u8>>, String> {
     let mut loaded = load(name, text, &project::Disk);
-    let changes =
-        Changes { method: Some(method), step: (method != Method::Adaptive).then_some(STEP), ..Changes::default() };
+    let changes = Changes {
+        method: Some(method),
+        step: (method != Method::Adaptive).then_some(STEP),
+        any_step: true,
+        ..Changes::default()
+    };
     let built = compiler::build(&mut loaded, &project::Disk, model, &changes, &mut Vec::new());
     let mut built = built.map_err(|found| found.first().map_or_else(String::new, |first| first.code.to_string()))?;
     built.program.size_rings(STEP);

@@ -9,12 +9,14 @@ use abi::{Description, Function, Slot};
 pub use compiler::analysis::dissipation::Verdict;
 pub use compiler::analysis::explain::{Explanation, QuantityInfo, StepCost};
 pub use compiler::analysis::linearise::{Linear, Matrices, Ports};
-pub use compiler::analysis::step_stability::LONGEST as LONGEST_STEP;
+pub use compiler::analysis::step_stability::largest_stable;
+pub use compiler::analysis::step_stability_report::stable_up_to;
 pub use compiler::codegen::elementary::Alone;
 use compiler::codegen::lanes;
 use compiler::codegen::target::{self, FunctionCompiler};
 use compiler::codegen::unsupported::Unsupported;
 use compiler::codegen::{c, image, jit};
+pub use compiler::experiment::spaced;
 pub use compiler::experiment::vary::{PreparedRun, Varying};
 pub use compiler::frontend::names::nearest;
 pub use compiler::frontend::resolve::{Lookup, Space};
@@ -22,8 +24,8 @@ pub use compiler::frontend::system::LINTS;
 use compiler::opt::reassociate;
 pub use compiler::rig::{StepDerivative, bus_load, dbc_messages, linear as linear_of};
 pub use compiler::{
-    Built, Case, Changes, Loaded, Options, Ready, SourceFile, Sources, build, check, check_models, compile,
-    dissipation, explain, explain_in, explain_run, linear, load, quantities, rig, stepping, varying,
+    Built, Case, Changes, Loaded, Options, Ready, SourceFile, Sources, build, check, check_declarations, compile,
+    dissipation, explain, explain_in, explain_rig, explain_run, linear, load, quantities, rig, stepping, varying,
 };
 use grammar::diagnostic::Diagnostic;
 use std::time::Instant;

@@ -205,11 +205,16 @@ pub fn cases(terminal: &Terminal, labels: &[&str], results: &[Result<Outcome, Fa
         let verdicts = result.as_ref().map_or(&[][..], |outcome| &outcome.verdicts[..]);
         let mut found: Vec<(String, String)> = Vec::new();
         for verdict in verdicts {
+            let window = window(&verdict.text);
             let shown = verdict.shown.as_ref().filter(|_| verdict.readings.len() != 1);
-            let readings = verdict.readings.iter().chain(shown.map(|shown| shown as &Reading));
-            for reading in readings {
-                if found.iter().all(|(text, _)| *text != reading.text) {
-                    found.push((reading.text.clone(), show(reading.value, &reading.unit, 6)));
+            for reading in verdict.readings.iter().chain(shown) {
+                let title = if reading.text.ends_with(window) {
+                    reading.text.clone()
+                } else {
+                    format!("{}{window}", reading.text)
+                };
+                if found.iter().all(|(text, _)| *text != title) {
+                    found.push((title, show(reading.value, &reading.unit, 6)));
                 }
             }
         }
@@ -257,6 +262,29 @@ pub fn cases(terminal: &Terminal, labels: &[&str], results: &[Result<Outcome, Fa
         out += &format!("{indent}{}\n", cells.join("  ").trim_end());
     }
     out
+}
+
+/// The window of an expectation as written, ` after 1 s`: it stands outside of brackets, before the cases.
+fn window(text: &str) -> &str {
+    let mut depth = 0;
+    let mut begin = text.len();
+    for (at, c) in text.char_indices() {
+        match c {
+            '(' => depth += 1,
+            ')' => depth -= 1,
+            ' ' if depth == 0 => {
+                let rest = &text[at..];
+                if begin == text.len() && (rest.starts_with(" after ") || rest.starts_with(" before ")) {
+                    begin = at;
+                }
+                if rest.starts_with(" for ") {
+                    return if begin < at { &text[begin..at] } else { "" };
+                }
+            }
+            _ => {}
+        }
+    }
+    &text[begin..]
 }
 
 /// The value with its error, the distance to the limit, and the time.
@@ -383,6 +411,14 @@ pub fn finer(experiment: &Experiment, companions: &[Solver]) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn the_window_of_an_expectation_is_found() {
+        assert_eq!(window("max(x) < 1 m after 5 s before 9 s for vp = 1 m/s"), " after 5 s before 9 s");
+        assert_eq!(window("max(x after 1 s) < 1 m"), "");
+        assert_eq!(window("max(F) before first(x > 50 mm)"), " before first(x > 50 mm)");
+        assert_eq!(window("max(F) < 1 N for fr = LuGre()"), "");
+    }
 
     #[test]
     fn non_finite_numbers_are_json_strings() {

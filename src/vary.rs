@@ -62,7 +62,7 @@ fn listed(text: &str, examples: &str) -> Result<(Unit, How), String> {
         let count = number.trim().parse::<usize>().ok().filter(|count| (2..=MOST_VALUES).contains(count));
         let count = count.ok_or(format!("`{}` is no number of values: 2 to {MOST_VALUES}", number.trim()))?;
         let [first, last] = [values[0], values[1]];
-        if log && !(first * last > 0.0) {
+        if log && first * last <= 0.0 {
             return Err("a logarithmic grid has ends of one sign, and neither is 0".into());
         }
         let rounded = |value: &f64| {

@@ -27,7 +27,7 @@ experiment hunting {
 fn servo(target: Target) -> (Image, Instance) {
     let sources = Texts::default();
     let mut loaded = compiler::load("servo.fric", SERVO, &sources);
-    let changes = Changes { method: Some(Method::Expo), step: Some(1e-5), ..Changes::default() };
+    let changes = Changes { method: Some(Method::Expo), step: Some(1e-5), any_step: true, ..Changes::default() };
     let variants = experiment::read(&mut loaded, &sources, "hunting", &changes, &mut Vec::new(), &mut |_| ());
     let program = variants.expect("the servo compiles").remove(0).program;
     let functions = functions(&program, Method::Expo);

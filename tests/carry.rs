@@ -30,7 +30,7 @@ fn echo(h: f64, set: &[&str]) -> Instance {
     let sources = Texts::default();
     let mut loaded = compiler::load("echo.fric", ECHO, &sources);
     let set = set.iter().map(|set| set.to_string()).collect();
-    let changes = Changes { set, method: Some(Method::Expo), step: Some(h), ..Changes::default() };
+    let changes = Changes { set, method: Some(Method::Expo), step: Some(h), any_step: true, ..Changes::default() };
     let options = Options { changes, interpret: true };
     let cases = compiler::compile(&mut loaded, &sources, "echo", &options, &mut Vec::new(), &mut |_| ());
     let mut instance = cases.unwrap_or_else(|errors| panic!("{errors:?}")).remove(0).instance;

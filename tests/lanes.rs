@@ -51,7 +51,7 @@ experiment sampled { run Sampled() for 2 s  expect final(x) > -10 m }
 fn varying(experiment: &str, path: &str, solver: Option<(Method, f64)>) -> Varying {
     let mut loaded = compiler::load("lanes.fric", TEXT, &Texts::default());
     let (method, step) = solver.unzip();
-    let changes = Changes { vary: vec![path.into()], method, step, ..Changes::default() };
+    let changes = Changes { vary: vec![path.into()], method, step, any_step: true, ..Changes::default() };
     let options = Options { changes, interpret: false };
     let cases = compiler::varying(&mut loaded, &Texts::default(), experiment, &options, &mut Vec::new());
     cases.unwrap_or_else(|found| panic!("{experiment}: {found:?}")).remove(0)
@@ -121,7 +121,7 @@ fn start_values_share_their_lanes() {
             Steps::Relaxing => Some((method, [1e-3, 5e-4][random.below(2)])),
         };
         let (method, step) = solver.unzip();
-        let plain = Changes { method, step, ..Changes::default() };
+        let plain = Changes { method, step, any_step: true, ..Changes::default() };
         let case = compiled(experiment, plain.clone());
         let description = case.instance.description().clone();
         let is_state = |kind| matches!(kind, Kind::State | Kind::SampledState);

@@ -568,10 +568,11 @@ fn a_session_on_imports_of_imports_is_saved() {
     fs::create_dir_all(folder.join("parts")).unwrap();
     fs::write(folder.join("parts/driven.fric"), "model Driven { state x [m] = 0  dx/dt = 1 m/s  output y [m] = x }\n")
         .unwrap();
-    let outer = "import \"parts/driven.fric\"\nimport std.interfaces\nexperiment go { run Driven() for 1 s  plot y }\n";
+    let outer =
+        "import \"parts/driven.fric\"\nimport std.interfaces\nexperiment moves { run Driven() for 1 s  plot y }\n";
     fs::write(folder.join("outer.fric"), outer).unwrap();
     for to in ["saved.fric", "deep/down/saved.fric"] {
-        let script = format!("use \"outer.fric\"\nrun go\nexpect final(y) > 0.5 m\nsave {to}\n");
+        let script = format!("use \"outer.fric\"\nrun moves\nexpect final(y) > 0.5 m\nsave {to}\n");
         let done = piped(&folder, &["repl"], &script);
         assert_eq!(done.status.code(), Some(0), "{to}: {}", text(&done.stderr));
         let test = fric(&folder).args(["test", to]).output().unwrap();

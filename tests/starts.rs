@@ -60,7 +60,7 @@ fn varied(text: &str, name: &str, path: &str, value: f64, typical: &str, method:
 
 fn of(method: Method) -> Changes {
     let step = (method != Method::Adaptive).then_some(1e-3);
-    Changes { method: Some(method), step, duration: Some(0.02), ..Changes::default() }
+    Changes { method: Some(method), step, duration: Some(0.02), any_step: true, ..Changes::default() }
 }
 
 /// The range of a state's initial value in its model, and the offset for an argument of the experiment's `run`.

@@ -34,7 +34,7 @@ pub use experiment::Changes;
 
 use abi::plan::Method;
 use abi::table::Code;
-use abi::{Function, Instance};
+use abi::{Function, Instance, Slot};
 use grammar::ast::Item;
 use grammar::diagnostic::{Diagnostic, Recurring};
 use grammar::span::FileId;
@@ -74,7 +74,7 @@ pub fn compile(
     warnings: &mut Vec<Diagnostic>,
     on_stage: &mut dyn FnMut(&'static str),
 ) -> Result<Vec<Case>, Vec<Diagnostic>> {
-    let variants = experiment::read(loaded, sources, experiment, &options.changes, warnings, on_stage)?;
+    let variants = read(loaded, sources, experiment, &options.changes, warnings, on_stage)?;
     on_stage("code");
     let mut made = None;
     let cases = variants.into_iter().map(|variant| case(variant, options.interpret, &mut made)).collect();
@@ -92,7 +92,7 @@ pub fn varying(
     options: &Options,
     warnings: &mut Vec<Diagnostic>,
 ) -> Result<Vec<experiment::vary::Varying>, Vec<Diagnostic>> {
-    let variants = experiment::read(loaded, sources, experiment, &options.changes, warnings, &mut |_| ())?;
+    let variants = read(loaded, sources, experiment, &options.changes, warnings, &mut |_| ())?;
     let varied =
         |variant: &experiment::Variant| experiment::start_values::params(&variant.system, &options.changes.vary);
     if let Some(error) = variants.iter().find_map(|variant| experiment::vary::built_in(variant, &varied(variant))) {
@@ -270,7 +270,7 @@ pub fn judging(judge: &ir::program::Program) -> Vec<(Function, ir::Func)> {
     vec![(Function::Outputs, math::expand(&judge.outputs))]
 }
 
-/// Compiles a rig as far as its lowered programs.
+/// Compiles a rig as far as its lowered programs, and checks its steps.
 fn lowered_rig(
     loaded: &mut Loaded,
     sources: &dyn Sources,
@@ -278,6 +278,24 @@ fn lowered_rig(
     options: &Options,
     warnings: &mut Vec<Diagnostic>,
 ) -> Result<rig::Lowered, Vec<Diagnostic>> {
+    let (cut, lowered) = cut_rig(loaded, sources, name, options, warnings)?;
+    let control = (&cut.control, &cut.control_types);
+    let steps = cut.steps(control, &lowered.rig, &lowered.control, &loaded.files);
+    if steps.iter().any(Diagnostic::is_error) {
+        return Err(steps);
+    }
+    warnings.extend(steps);
+    Ok(lowered)
+}
+
+/// A rig before and after lowering.
+fn cut_rig(
+    loaded: &mut Loaded,
+    sources: &dyn Sources,
+    name: &str,
+    options: &Options,
+    warnings: &mut Vec<Diagnostic>,
+) -> Result<(rig::PartitionedRig, rig::Lowered), Vec<Diagnostic>> {
     let mut diagnostics = Vec::new();
     let overrides = experiment::overrides(loaded, &options.changes, &mut diagnostics);
     let root = loaded.root();
@@ -293,12 +311,7 @@ fn lowered_rig(
     };
     warnings.extend(diagnostics);
     let lowered = cut.lowered(warnings);
-    let steps = cut.steps(&lowered, &loaded.files);
-    if steps.iter().any(Diagnostic::is_error) {
-        return Err(steps);
-    }
-    warnings.extend(steps);
-    Ok(lowered)
+    Ok((cut, lowered))
 }
 
 /// Code of the previous case, and the program that it was made from.
@@ -337,11 +350,11 @@ impl CachedCode {
 /// of the previous one.
 fn case(variant: experiment::Variant, interpret: bool, made: &mut Option<CachedCode>) -> Case {
     let experiment::Variant { label, mut program, adaptive, mut experiment, mut rig, .. } = variant;
-    let stepped = rig.as_mut().map_or(&mut program, |(_, plant)| plant);
+    let stepped = rig.as_mut().map_or(&mut program, |simulated| &mut simulated.plant);
     if experiment.solver.method != Method::Adaptive && !stepped.description.delays.is_empty() {
         stepped.size_rings_for_companions(experiment.solver.step);
     }
-    let method = rig.as_ref().map_or(experiment.solver.method, |(rig, _)| rig.method);
+    let method = rig.as_ref().map_or(experiment.solver.method, |simulated| simulated.rig.method);
     let (description, params) = (Arc::new(program.description.clone()), program.params.clone());
     if !made.as_ref().is_some_and(|made| made.fits(&program, method)) {
         let (code, notes) = codegen::tiering::late(&program, method, interpret);
@@ -354,7 +367,8 @@ fn case(variant: experiment::Variant, interpret: bool, made: &mut Option<CachedC
     if let Some((program, code)) = adaptive.zip(adaptive_code.clone()) {
         instance = instance.with_adaptive(Arc::new(Instance::new(Arc::new(program.description), code, &params)));
     }
-    experiment.bench = rig.map(|(rig, plant)| Box::new(bench(rig, &plant, experiment.solver.method, interpret)));
+    experiment.bench =
+        rig.map(|simulated| Box::new(bench(simulated.rig, &simulated.plant, experiment.solver.method, interpret)));
     Case { label, instance, experiment, notes: notes.clone() }
 }
 
@@ -427,10 +441,17 @@ pub fn explain_in(
         return Err(vec![Diagnostic::error("E0201", format!("there is no model `{model}` in this file"))]);
     };
     let (system, types, diagnostics) = alone(loaded, sources, (model, item.file), Vec::new(), Depth::Causality);
-    match diagnostics.iter().any(Diagnostic::is_error) {
-        true => Err(once(diagnostics)),
-        false => Ok(analysis::explain::explain(&system, &types, &loaded.files)),
+    if diagnostics.iter().any(Diagnostic::is_error) {
+        return Err(once(diagnostics));
     }
+    let open = lower::lower(&system, &types, &[]).program;
+    // Steps are judged with the inputs that have a default at that value, as in an experiment that does not set them.
+    let (system_given, types_given, found) = defaulted(loaded, sources, model, item.file, Depth::Causality);
+    let given = match found.iter().any(Diagnostic::is_error) {
+        true => None,
+        false => Some(lower::lower(&system_given, &types_given, &[]).program),
+    };
+    Ok(analysis::explain::explain(&system, &types, &open, (given.as_ref(), &[]), &loaded.files))
 }
 
 /// Compiles a model of the text on its own, ready for fixed steps of `step` s, at its start with its inputs at 0.
@@ -470,7 +491,8 @@ pub fn quantities(
     experiment: &str,
     changes: &Changes,
 ) -> Result<Vec<analysis::explain::QuantityInfo>, Vec<Diagnostic>> {
-    let variant = first(loaded, sources, experiment, changes, &mut Vec::new())?;
+    let changes = Changes { any_step: true, ..changes.clone() };
+    let variant = first(loaded, sources, experiment, &changes, &mut Vec::new())?;
     Ok(analysis::explain::quantities(&variant.system, &variant.types, &loaded.files))
 }
 
@@ -483,8 +505,49 @@ pub fn explain_run(
     experiment: &str,
     changes: &Changes,
 ) -> Result<analysis::explain::Explanation, Vec<Diagnostic>> {
-    let variant = first(loaded, sources, experiment, changes, &mut Vec::new())?;
-    Ok(analysis::explain::explain(&variant.system, &variant.types, &loaded.files))
+    let changes = Changes { any_step: true, ..changes.clone() };
+    let variant = first(loaded, sources, experiment, &changes, &mut Vec::new())?;
+    let ends: Vec<Slot> =
+        variant.rig.iter().flat_map(|simulated| simulated.rig.stops.iter().map(|stop| stop.slot)).collect();
+    let (system, types) = (&variant.system, &variant.types);
+    Ok(analysis::explain::explain(system, types, &variant.program, (None, &ends), &loaded.files))
+}
+
+/// Explains the control program of a rig.
+///
+/// # Errors All errors of the rig, except that its steps are unstable.
+pub fn explain_rig(
+    loaded: &mut Loaded,
+    sources: &dyn Sources,
+    name: &str,
+) -> Result<analysis::explain::Explanation, Vec<Diagnostic>> {
+    let (cut, lowered) = cut_rig(loaded, sources, name, &Options::default(), &mut Vec::new())?;
+    let ends: Vec<Slot> = lowered.rig.stops.iter().map(|stop| stop.slot).collect();
+    let (system, types) = (&cut.control, &cut.control_types);
+    Ok(analysis::explain::explain(system, types, &lowered.control, (None, &ends), &loaded.files))
+}
+
+/// Reads an experiment and checks its steps. All that runs, builds or explains an experiment reads it here, so that
+/// nothing uses what `check` refuses.
+fn read(
+    loaded: &mut Loaded,
+    sources: &dyn Sources,
+    name: &str,
+    changes: &Changes,
+    warnings: &mut Vec<Diagnostic>,
+    on_stage: &mut dyn FnMut(&'static str),
+) -> Result<Vec<experiment::Variant>, Vec<Diagnostic>> {
+    let variants = experiment::read(loaded, sources, name, changes, warnings, on_stage)?;
+    if changes.any_step {
+        return Ok(variants);
+    }
+    let (errors, more): (Vec<_>, Vec<_>) =
+        steps(loaded, name, changes, &variants).into_iter().partition(Diagnostic::is_error);
+    if !errors.is_empty() {
+        return Err(errors);
+    }
+    warnings.extend(more);
+    Ok(variants)
 }
 
 /// Reads an experiment and returns the first combination of its sweeps.
@@ -495,7 +558,7 @@ fn first(
     changes: &Changes,
     warnings: &mut Vec<Diagnostic>,
 ) -> Result<experiment::Variant, Vec<Diagnostic>> {
-    let variants = experiment::read(loaded, sources, experiment, changes, warnings, &mut |_| ())?;
+    let variants = read(loaded, sources, experiment, changes, warnings, &mut |_| ())?;
     Ok(variants.into_iter().next().expect("there is at least one combination"))
 }
 
@@ -571,15 +634,10 @@ pub fn check(loaded: &mut Loaded, sources: &dyn Sources) -> Vec<Diagnostic> {
     let gaps = loaded.models().iter().any(|model| loaded.misread(model.span));
     for item in ast.items() {
         match item {
-            Item::Model(model) => all.extend(check_model(loaded, sources, model, true)),
             Item::Experiment(experiment) => {
                 let mut warnings = Vec::new();
-                let changes = Changes::default();
-                match experiment::read(loaded, sources, &experiment.name.text, &changes, &mut warnings, &mut |_| ()) {
-                    Ok(variants) => {
-                        all.extend(warnings);
-                        all.extend(steps(loaded, experiment, &variants));
-                    }
+                match read(loaded, sources, &experiment.name.text, &Changes::default(), &mut warnings, &mut |_| ()) {
+                    Ok(_) => all.extend(warnings),
                     Err(errors) => {
                         // Declarations of an unreadable statement are missing in the experiment too; their absence is
                         // not reported again.
@@ -589,14 +647,6 @@ pub fn check(loaded: &mut Loaded, sources: &dyn Sources) -> Vec<Diagnostic> {
                         all.extend(errors.into_iter().filter(|d| !(gaps && missing(d))));
                     }
                 }
-            }
-            // Callers of a function that grows without bound grow without bound too, and would each repeat the error.
-            Item::Function(_) if all.iter().any(|d| d.recurring == Some(Recurring::Operations)) => {}
-            Item::Function(_) | Item::Const(_) | Item::Table(_) => {
-                let flat = frontend::flatten::flatten_item(loaded, sources, root, item);
-                let mut diagnostics = flat.diagnostics;
-                analyse(&flat.system, &loaded.files, Depth::Units, &Diagnostic::is_error, &mut diagnostics);
-                all.extend(diagnostics);
             }
             Item::Fit(fit) => {
                 let error = Diagnostic::error("E0905", format!("`fit {}` is not available yet", fit.name.text));
@@ -609,7 +659,9 @@ pub fn check(loaded: &mut Loaded, sources: &dyn Sources) -> Vec<Diagnostic> {
                     Err(errors) => all.extend(errors),
                 }
             }
-            Item::Interface(interface) => all.extend(check_interface(loaded, sources, interface)),
+            Item::Model(_) | Item::Function(_) | Item::Const(_) | Item::Table(_) | Item::Interface(_) => {
+                check_declaration(loaded, sources, item, true, &mut all);
+            }
             Item::Import(_) | Item::Device(_) => {}
         }
     }
@@ -620,12 +672,46 @@ pub fn check(loaded: &mut Loaded, sources: &dyn Sources) -> Vec<Diagnostic> {
     once(all)
 }
 
+/// Checks the declarations of a loaded text, as [`check`] does, without the physics of friction, which only warns. Fast
+/// enough to precede each run; with the check of an experiment in [`compile()`], a run finds each error that `check` finds
+/// in what it uses.
+pub fn check_declarations(loaded: &Loaded, sources: &dyn Sources) -> Vec<Diagnostic> {
+    let mut all = Vec::new();
+    for item in loaded.files.get(loaded.root()).ast.items() {
+        check_declaration(loaded, sources, item, false, &mut all);
+    }
+    once(all)
+}
+
+/// Checks a model, function, constant, table or interface; `physics` includes the physics of friction.
+fn check_declaration(loaded: &Loaded, sources: &dyn Sources, item: &Item, physics: bool, all: &mut Vec<Diagnostic>) {
+    match item {
+        Item::Model(model) => all.extend(check_model(loaded, sources, model, physics)),
+        // Callers of a function that grows without bound grow without bound too, and would each repeat the error.
+        Item::Function(_) if all.iter().any(|d| d.recurring == Some(Recurring::Operations)) => {}
+        Item::Function(_) | Item::Const(_) | Item::Table(_) => {
+            let flat = frontend::flatten::flatten_item(loaded, sources, loaded.root(), item);
+            let mut diagnostics = flat.diagnostics;
+            analyse(&flat.system, &loaded.files, Depth::Units, &Diagnostic::is_error, &mut diagnostics);
+            all.extend(diagnostics);
+        }
+        Item::Interface(interface) => all.extend(check_interface(loaded, sources, interface)),
+        Item::Experiment(_) | Item::Fit(_) | Item::Rig(_) | Item::Import(_) | Item::Device(_) => {}
+    }
+}
+
 /// Limit on the combinations of one experiment whose steps are checked.
 const MOST_STEPPED: usize = 4;
 
 /// Warnings and errors about the steps and ticks of an experiment, each code once for all combinations of its sweeps.
-fn steps(loaded: &Loaded, experiment: &grammar::ast::Experiment, variants: &[experiment::Variant]) -> Vec<Diagnostic> {
+fn steps(loaded: &Loaded, name: &str, changes: &Changes, variants: &[experiment::Variant]) -> Vec<Diagnostic> {
+    use analysis::step_stability_report::StepBy;
     use grammar::ast::ExperimentStatement as Statement;
+    let experiment = loaded.files.get(loaded.root()).ast.items().find_map(|item| match item {
+        Item::Experiment(experiment) if experiment.name.text == name => Some(experiment),
+        _ => None,
+    });
+    let Some(experiment) = experiment.filter(|_| !loaded.has_errors()) else { return Vec::new() };
     let run = experiment.body.iter().find_map(|statement| match statement {
         Statement::Run(run) => Some(run.instance.span),
         _ => None,
@@ -635,22 +721,29 @@ fn steps(loaded: &Loaded, experiment: &grammar::ast::Experiment, variants: &[exp
         _ => None,
     });
     let Some(run) = run else { return Vec::new() };
-    let looked_at = variants.iter().filter(|variant| variant.rig.is_none() && !loaded.has_errors());
-    let said = looked_at.take(MOST_STEPPED).flat_map(|variant| {
+    let outside = changes.method.is_some() || changes.step.is_some();
+    let said = variants.iter().take(MOST_STEPPED).flat_map(|variant| {
         let abi::plan::Solver { method, step, .. } = variant.experiment.solver;
         let (system, types, program) = (&variant.system, &variant.types, &variant.program);
+        if let Some(experiment::SimulatedRig { rig, cut, .. }) = &variant.rig {
+            // Warnings concern the rig, and are not repeated for each of its experiments.
+            let mut found = cut.steps((system, types), rig, program, &loaded.files);
+            found.retain(Diagnostic::is_error);
+            return found;
+        }
         let mut found = analysis::acting_mass::check(system, types, program, None, run);
-        if let Some(place) = solver.filter(|_| method != Method::Adaptive) {
+        if method != Method::Adaptive {
             let fixed = analysis::step_stability_report::Fixed {
                 system,
                 types,
                 program,
                 method,
                 step,
-                place,
+                place: solver.filter(|_| !outside).unwrap_or(run),
                 run,
                 ends: &[],
-                rig: false,
+                by: if outside { StepBy::Option } else { StepBy::Text },
+                name,
             };
             found.extend(analysis::step_stability_report::check(&fixed, &loaded.files));
         }
@@ -672,13 +765,6 @@ fn steps(loaded: &Loaded, experiment: &grammar::ast::Experiment, variants: &[exp
     said
 }
 
-/// Checks the models of a loaded text, each on its own, without the physics of friction. Fast enough to precede each
-/// run.
-pub fn check_models(loaded: &Loaded, sources: &dyn Sources) -> Vec<Diagnostic> {
-    let models = loaded.models();
-    once(models.into_iter().flat_map(|model| check_model(loaded, sources, model, false)).collect())
-}
-
 /// Checks a model of the text on its own; `physics` includes the physics of friction.
 fn check_model(loaded: &Loaded, sources: &dyn Sources, model: &grammar::ast::Model, physics: bool) -> Vec<Diagnostic> {
     let file = loaded.root();
@@ -692,7 +778,10 @@ fn check_model(loaded: &Loaded, sources: &dyn Sources, model: &grammar::ast::Mod
     diagnostics.extend(with_defaults(loaded, sources, model));
     if loaded.misread(model.span) {
         // Unreadable declarations are missing elsewhere; the report names only the cause.
-        diagnostics.retain(|d| !matches!(d.code, "E0106" | "E0203" | "E0204" | "E0303" | "E0305" | "E0310" | "E0501"));
+        let consequence = |d: &Diagnostic| {
+            matches!(d.code, "E0106" | "E0203" | "E0204" | "E0301" | "E0303" | "E0305" | "E0310" | "E0501")
+        };
+        diagnostics.retain(|d| !consequence(d));
     }
     analysis::lints::silence(&system, &mut diagnostics);
     diagnostics
@@ -708,8 +797,22 @@ fn with_defaults(loaded: &Loaded, sources: &dyn Sources, model: &grammar::ast::M
     if !given {
         return Vec::new();
     }
+    let depth = if loaded.has_errors() { Depth::Values } else { Depth::Domains };
+    let (_, _, mut diagnostics) = defaulted(loaded, sources, model, loaded.root(), depth);
+    diagnostics.retain(Diagnostic::is_error);
+    diagnostics
+}
+
+/// A model on its own, with the inputs that have a default at that value.
+fn defaulted(
+    loaded: &Loaded,
+    sources: &dyn Sources,
+    model: &grammar::ast::Model,
+    file: FileId,
+    depth: Depth,
+) -> (frontend::system::System, frontend::units::Types, Vec<Diagnostic>) {
     let request = frontend::flatten::Request {
-        instance: frontend::flatten::Instance::WithDefaults(model, loaded.root()),
+        instance: frontend::flatten::Instance::WithDefaults(model, file),
         overrides: Vec::new(),
         observed: Vec::new(),
         data: Vec::new(),
@@ -717,10 +820,8 @@ fn with_defaults(loaded: &Loaded, sources: &dyn Sources, model: &grammar::ast::M
     };
     let frontend::flatten::Flattened { system, mut diagnostics, .. } =
         frontend::flatten::flatten(loaded, sources, &request);
-    let depth = if loaded.has_errors() { Depth::Values } else { Depth::Domains };
-    analyse(&system, &loaded.files, depth, &Diagnostic::is_error, &mut diagnostics);
-    diagnostics.retain(Diagnostic::is_error);
-    diagnostics
+    let types = analyse(&system, &loaded.files, depth, &Diagnostic::is_error, &mut diagnostics);
+    (system, types, diagnostics)
 }
 
 /// Checks the ports of an interface: their units, defaults and ranges.

@@ -449,7 +449,7 @@ fn wrong(text: &Text, seed: u64) -> (Option<String>, bool) {
     let shown = text.show();
     let mut loaded = crate::load("a.fric", &shown, &crate::NoSources);
     let accepted =
-        !loaded.has_errors() && !crate::check_models(&loaded, &crate::NoSources).iter().any(|d| d.is_error());
+        !loaded.has_errors() && !crate::check_declarations(&loaded, &crate::NoSources).iter().any(|d| d.is_error());
     if !accepted {
         return (None, false);
     }

@@ -425,7 +425,7 @@ pub struct Experiment {
 
 /// One statement of an experiment.
 #[derive(Clone, PartialEq, Debug)]
-#[allow(missing_docs)]
+#[allow(missing_docs, clippy::large_enum_variant)] // there are few
 pub enum ExperimentStatement {
     Run(Run),
     Solver(Solver),
@@ -456,7 +456,7 @@ pub struct Solver {
     pub span: Span,
 }
 
-/// `sweep fr = LuGre(), KFM()`, `sweep fr.Fs = 1 N .. 2 N by 0.25 N`
+/// `sweep fr = LuGre(), KFM()`, `sweep fr.Fs = 1 N .. 2 N by 0.25 N`, `sweep rate = 1 N/s .. 50 N/s log 10`
 #[derive(Clone, PartialEq, Debug)]
 #[allow(missing_docs)]
 pub struct Sweep {
@@ -473,15 +473,26 @@ pub enum SweepOver {
     Instances(Vec<Instance>),
     /// Values, listed.
     Values(Vec<Expr>),
-    /// Values `first .. last by step`.
+    /// Values `first .. last by step`, `first .. last log 10`.
     Grid {
         /// First value.
         first: Expr,
-        /// Last value, included if it is a whole number of steps from the first.
+        /// Last value; by a step it is included if it is a whole number of steps from the first.
         last: Expr,
-        /// Step.
-        step: Expr,
+        /// The values between.
+        spacing: Spacing,
     },
+}
+
+/// The values of a grid between its ends.
+#[derive(Clone, PartialEq, Debug)]
+pub enum Spacing {
+    /// `by step`: in steps.
+    By(Expr),
+    /// `lin 5`: this number of values at equal distances.
+    Lin(Expr),
+    /// `log 10`: this number of values in equal ratios.
+    Log(Expr),
 }
 
 /// `data "pull.csv" (t [s], x [mm])`
@@ -548,6 +559,17 @@ pub struct Expect {
     pub shows: Option<Option<UnitText>>,
     pub after: Option<Expr>,
     pub before: Option<Expr>,
+    /// `for v = 0.3 m/s`: the cases of the sweeps to which it applies; all if empty.
+    pub cases: Vec<Case>,
+    pub span: Span,
+}
+
+/// One value of a sweep, `v = 0.3 m/s` or `fr = LuGre()`.
+#[derive(Clone, PartialEq, Debug)]
+#[allow(missing_docs)]
+pub struct Case {
+    pub path: Path,
+    pub value: BindValue,
     pub span: Span,
 }
 

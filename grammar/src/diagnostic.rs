@@ -39,6 +39,10 @@ pub enum WordMistake {
     Reserved,
     /// A word does not fit where it stands.
     Misfit,
+    /// A word begins a choice or a loop of statements, as in other languages.
+    Block,
+    /// A word ends such a block.
+    BlockEnd,
 }
 
 /// One error or warning: the problem, its place, and a suggestion.

@@ -224,11 +224,15 @@ impl<'t> Reader<'t> {
         let of = |mistake: WordMistake| move |d: &&Diagnostic| d.word == Some(mistake);
         let reserved: HashSet<&str> = self.diagnostics.iter().filter(of(WordMistake::Reserved)).map(word).collect();
         let mut seen = HashSet::new();
+        let mut blocks = false;
         self.diagnostics.retain(|d| match d.word {
             // An error at each use of the name; reported once.
             Some(mistake @ (WordMistake::ForeignName | WordMistake::Reserved)) => seen.insert((mistake, word(d))),
             // A keyword as a name is reported at its declaration, not at its uses.
             Some(WordMistake::Misfit) => !reserved.contains(word(d)),
+            // A choice or a loop of another language has several statements; it is reported once, and its end with it.
+            Some(WordMistake::Block) => !std::mem::replace(&mut blocks, true),
+            Some(WordMistake::BlockEnd) => !blocks,
             None => true,
         });
         self.diagnostics.truncate(DIAGNOSTIC_LIMIT);
@@ -798,8 +802,8 @@ impl<'t> Reader<'t> {
                         children.all(Rule::expr).into_iter().map(|value| self.expr(value)).collect();
                     let before = if before { edges.pop() } else { None };
                     let after = if after { edges.pop() } else { None };
-                    let (value, shows) = (show.value, Some(show.unit));
-                    ExperimentStatement::Expect(Expect { value, near: None, shows, after, before, span })
+                    let (value, shows, cases) = (show.value, Some(show.unit), self.cases(&mut children));
+                    ExperimentStatement::Expect(Expect { value, near: None, shows, after, before, cases, span })
                 }
                 Rule::allow => ExperimentStatement::Allow(self.allow(pair)),
                 Rule::vary => {
@@ -1084,15 +1088,22 @@ impl<'t> Reader<'t> {
     }
 
     fn sweep(&mut self, pair: Pair<'t, Rule>) -> Sweep {
-        let (grid, span) = (says(&pair, Rule::kw_by), self.span(&pair));
+        let spacing = [Rule::kw_by, Rule::kw_lin, Rule::kw_log].into_iter().find(|word| says(&pair, *word));
+        let span = self.span(&pair);
         let mut children = Children::of(pair);
         let path = children.one();
         let path = self.path(path);
         children.maybe(Rule::eq);
         let instances = children.all(Rule::inst);
-        let over = if grid {
+        let over = if let Some(word) = spacing {
             let (first, last) = (self.value(&mut children), self.value(&mut children));
-            SweepOver::Grid { first, last, step: self.value(&mut children) }
+            let value = self.value(&mut children);
+            let spacing = match word {
+                Rule::kw_lin => Spacing::Lin(value),
+                Rule::kw_log => Spacing::Log(value),
+                _ => Spacing::By(value),
+            };
+            SweepOver::Grid { first, last, spacing }
         } else if instances.is_empty() {
             SweepOver::Values(children.all(Rule::expr).into_iter().map(|value| self.expr(value)).collect())
         } else {
@@ -1114,14 +1125,33 @@ impl<'t> Reader<'t> {
 
     fn expect(&mut self, pair: Pair<'t, Rule>) -> Expect {
         let (after, before, span) = (says(&pair, Rule::kw_after), says(&pair, Rule::kw_before), self.span(&pair));
-        let mut values: Vec<Expr> =
-            Children::of(pair).all(Rule::expr).into_iter().map(|value| self.expr(value)).collect();
+        let mut children = Children::of(pair);
+        let mut values: Vec<Expr> = children.all(Rule::expr).into_iter().map(|value| self.expr(value)).collect();
+        let cases = self.cases(&mut children);
         let before = if before { values.pop() } else { None };
         let after = if after { values.pop() } else { None };
         let tolerance = if values.len() == 3 { values.pop() } else { None };
         let near = tolerance.and_then(|tolerance| values.pop().map(|target| (target, tolerance)));
         let value = values.pop().expect("the grammar asks for a condition");
-        Expect { value, near, shows: None, after, before, span }
+        Expect { value, near, shows: None, after, before, cases, span }
+    }
+
+    /// `for v = 0.3 m/s, fr = LuGre()`
+    fn cases(&mut self, children: &mut Children<'t>) -> Vec<Case> {
+        let Some(cases) = children.maybe(Rule::cases) else { return Vec::new() };
+        let one = |case: Pair<'t, Rule>| {
+            let span = self.span(&case);
+            let mut children = Children::of(case);
+            let path = children.one();
+            let path = self.path(path);
+            children.maybe(Rule::eq);
+            let value = match children.maybe(Rule::inst) {
+                Some(instance) => BindValue::Instance(self.instance(instance)),
+                None => BindValue::Expr(self.value(&mut children)),
+            };
+            Case { path, value, span }
+        };
+        Children::of(cases).all(Rule::one_case).into_iter().map(one).collect()
     }
 
     fn drive_argument(&mut self, pair: Pair<'t, Rule>) -> (Name, DriveArg) {
@@ -1484,7 +1514,7 @@ impl<'t> Reader<'t> {
         let text = |span: Span| &self.source.text[span.range()];
         // The operand after the second operator has not been read yet; its first words suffice.
         let behind = self.source.marks.partition_point(|mark| mark.token.start < place.end as usize);
-        let (a, b, c) = (text(left.outer), text(middle.outer), self.source.word(behind));
+        let (a, b, c) = (text(left.outer), text(middle.outer), slips::operand_at(&self.source, behind));
         let short = a.len() + b.len() < 60 && !a.contains('\n') && !b.contains('\n') && first != BinaryOp::Equal;
         let help = if short {
             format!("write `{a} {} {b} and {b} {} {c}`", first.text(), second.text())
@@ -1604,7 +1634,7 @@ fn words(rule: Rule) -> Option<String> {
         Rule::range => "a range with `in`",
         Rule::bound | Rule::bound_op => "a bound such as `> 0`",
         Rule::inst | Rule::inst_arg => "a model with its arguments, such as `LuGre()`",
-        Rule::bind | Rule::drive_arg | Rule::set => "`name = value`",
+        Rule::bind | Rule::drive_arg | Rule::set | Rule::one_case => "`name = value`",
         Rule::points => "points in braces",
         Rule::fn_arg | Rule::column => "a name",
         Rule::EOI => "the next statement",

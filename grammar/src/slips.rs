@@ -18,12 +18,14 @@ pub(crate) struct Stop {
 /// The diagnostic for an unreadable piece.
 pub(crate) fn explain(source: &Source, piece: Piece, stop: &Stop) -> Diagnostic {
     let finders = [
+        borrowed,
         unit_in_parentheses,
         character,
         head,
         operator,
         condition,
         habit,
+        branching,
         branch,
         unit,
         bare_unit,
@@ -187,6 +189,9 @@ fn character(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
         '“' | '”' | '„' => "text stands in plain double quotes, `\"`",
         '#' => "a comment begins with `//`",
         '%' if source.marks[at].first_on_line => "a comment begins with `//`",
+        '%' => "a comment begins with `//`; as a unit `%` stands after its number",
+        '@' => "a function is declared outside of models: `fn g(v [m/s]) [N] = ...`",
+        '~' => "write `not`; `!=` means different",
         '\u{a0}' | '\u{2009}' | '\u{202f}' | '\u{200b}' => "write a plain space",
         _ => "remove it",
     };
@@ -422,6 +427,84 @@ fn operator(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
     Some(Diagnostic::error("E0001", format!("`{here}` does not fit here")).label(source.span(at), "").help(instead))
 }
 
+/// Reports whole constructs of MATLAB, Python and Modelica, for which there is another way here. The list with more of
+/// them is in docs/from-matlab.md.
+fn borrowed(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
+    let (first, at) = (piece.start, stop.at);
+    if first >= piece.end {
+        return None;
+    }
+    let begin = source.word(first);
+    let error = |message: &str, from: usize, to: usize, help: String| {
+        Some(Diagnostic::error("E0001", message).label(source.span(from).to(source.span(to)), "").help(help))
+    };
+    let word = |at: usize| source.kind(at) == Some(TokenKind::Word);
+    // `x .* y`
+    if let Some(dot) = [Some(at), at.checked_sub(1)]
+        .into_iter()
+        .flatten()
+        .find(|&at| at + 1 < piece.end && source.is_symbol(at, ".") && matches!(source.word(at + 1), "*" | "/" | "^"))
+        && dot > first
+        && source.glued(dot + 1)
+    {
+        let sign = source.word(dot + 1);
+        return error("there are no arrays: each name is one number", dot, dot + 1, format!("write `{sign}`"));
+    }
+    // `g = @(v) Fc * sign(v)`
+    let at_sign = (first..piece.end.min(at + 2)).find(|&mark| source.word(mark) == "@");
+    if let Some(handle) = at_sign.filter(|&mark| source.is_symbol(mark + 1, "(")) {
+        let close = (handle..piece.end).find(|&mark| source.is_symbol(mark, ")"))?;
+        let name = if source.is_symbol(first + 1, "=") { begin } else { "g" };
+        let args = slice(source, handle + 1, close);
+        let help = format!("declare it outside of models, with the units of its arguments: `fn {name}{args} = ...`");
+        return error("a function has a name and is declared by `fn`", handle, close, help);
+    }
+    // `[t, y] = ode45(...)`
+    const SOLVERS: [&str; 12] = [
+        "ode45",
+        "ode23",
+        "ode15s",
+        "ode23s",
+        "ode23t",
+        "ode113",
+        "odeint",
+        "solve_ivp",
+        "lsim",
+        "sim",
+        "simulate",
+        "ode",
+    ];
+    let solver = (first..piece.end)
+        .find(|&mark| SOLVERS.contains(&source.word(mark)) && source.is_symbol(mark + 1, "("))
+        .filter(|&mark| stop.at <= mark && (stop.at + 1..=mark).all(|mark| !source.marks[mark].first_on_line));
+    if let Some(solver) = solver {
+        let help = "write `experiment e { run Model() for 10 s  plot x }`; it chooses its steps itself, or by `solver rk4 step 1 ms`";
+        return error("a model is run by an experiment", solver, solver, help.into());
+    }
+    // `plot(t, y)`
+    if begin == "plot" && source.is_symbol(first + 1, "(") && source.is_symbol(at, ",") {
+        let (x, y) = (slice(source, first + 2, at - 1), operand_at(source, at + 1));
+        let help = match x {
+            "t" | "time" => format!("over time write `plot {y}`"),
+            x => format!("write `plot {y} against {x}`"),
+        };
+        return error("`plot` names what is drawn, without brackets", first, at, help);
+    }
+    // `[1 2 3] N/m`: a row of numbers.
+    let open = (first..piece.end.min(at + 1)).rev().find(|&mark| source.is_symbol(mark, "["))?;
+    let close = (open..piece.end).find(|&mark| source.is_symbol(mark, "]"))?;
+    let number = |mark: usize| matches!(source.kind(mark), Some(TokenKind::Number | TokenKind::Unit));
+    let numbers = close > open + 2
+        && (open + 1..close).all(|mark| number(mark) || matches!(source.word(mark), "," | "-" | ";"))
+        && (open + 1..close).filter(|&mark| source.kind(mark) == Some(TokenKind::Number)).count() > 1;
+    let declared = word(first) && matches!(begin, "part" | "input" | "output") && open == first + 2;
+    if numbers && !declared && at <= close + 1 {
+        let help = "several equal parts are `part el[i in 1 .. 3] = Model(k = i * 1 N/m)`, points of a curve a `table`,\nand the values of a sweep `sweep k = 1 N/m, 2 N/m`";
+        return error("there are no arrays: each name is one number", open, close, help.into());
+    }
+    None
+}
+
 /// Reports notations of other languages that are written differently here.
 fn habit(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
     let (first, at) = (piece.start, stop.at);
@@ -459,7 +542,7 @@ fn habit(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
     }
     if matches!(here, "for" | "while" | "foreach" | "loop" | "repeat") && source.marks[at].first_on_line {
         let help = "every equation holds at every instant; for several equal parts write\n`part el[i in 1 .. 4] = Model(k = i)` and `sum(el.f)`";
-        return Some(error("there are no loops", at, at).help(help));
+        return Some(error("there are no loops", at, at).help(help).about_word(WordMistake::Block));
     }
     if begin == "fn" && here == "{" {
         let help = format!("write `{} = ...`; several steps are several functions", slice(source, first, at - 1));
@@ -519,12 +602,27 @@ fn unit(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
         && unit_word(at)
         && same_line(at)
     {
+        // Up to the end of the unit: further words, and what is glued to them by a sign.
         let mut last = at;
-        while unit_word(last + 1) && same_line(last + 1) {
-            last += 1;
+        loop {
+            let sign = last + 1 < piece.end
+                && source.glued(last + 1)
+                && matches!(source.word(last + 1), "/" | "*" | "·" | "^");
+            let power = source.word(last + 1) == "^" && source.kind(last + 2) == Some(TokenKind::Number);
+            last += match () {
+                () if last + 1 < piece.end && unit_word(last + 1) && same_line(last + 1) => 1,
+                () if last + 2 < piece.end && sign && source.glued(last + 2) && (unit_word(last + 2) || power) => 2,
+                () => break,
+            };
         }
         let (value, unit, stray) = (source.word(number), source.word(at - 1), source.word(at));
-        let rest: Vec<&str> = (at - 1..=last).map(|mark| source.word(mark)).collect();
+        let mut whole = unit.to_string();
+        for mark in at..=last {
+            if !source.glued(mark) {
+                whole.push('·');
+            }
+            whole.push_str(source.word(mark));
+        }
         return Some(
                 Diagnostic::error("E0110", "a unit is written without spaces")
                     .label(
@@ -532,9 +630,8 @@ fn unit(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
                         format!("reads as {value} {unit}, followed by a stray name `{stray}`"),
                     )
                     .help(format!(
-                        "write `{value} {}` (or `{value} {}`). To multiply by a variable `{stray}`, write `{value} {unit} * {stray}`",
-                        rest.join("·"),
-                        rest.join("*"),
+                        "write `{value} {whole}` (or `{value} {}`). To multiply by a variable `{stray}`, write `{value} {unit} * {stray}`",
+                        whole.replace('·', "*"),
                     )),
             );
     }
@@ -578,11 +675,7 @@ fn condition(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
     }
     let error = Diagnostic::error("E0001", "a comparison is written `==`").label(source.span(at), "`=` defines");
     let measured = source.is_word(piece.start, "expect") && at + 1 < piece.end;
-    let right = match at + 1 < piece.end {
-        true if at + 2 < piece.end && source.kind(at + 2) == Some(TokenKind::Unit) => slice(source, at + 1, at + 2),
-        true => source.word(at + 1),
-        false => "...",
-    };
+    let right = if at + 1 < piece.end { operand_at(source, at + 1) } else { "...".to_string() };
     Some(error.help(match measured {
         // Measures are real numbers, so a comparison to the last bit is hardly intended.
         true => {
@@ -591,6 +684,27 @@ fn condition(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
         }
         false => format!("write `{} == {right}`", operand_before(source, piece, at)),
     }))
+}
+
+/// Reports `if`, `else`, `end` as statements.
+fn branching(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
+    // `else` and `end` do not begin a piece, but end the statement before them.
+    let ends = stop.at < piece.end
+        && source.marks[stop.at].first_on_line
+        && matches!(source.word(stop.at), "else" | "elseif" | "end" | "endif" | "endfunction");
+    let first = if ends { stop.at } else { piece.start };
+    let (mistake, message, help) = match source.word(first) {
+        "if" | "else" | "elseif" => (
+            WordMistake::Block,
+            "a choice is a value, not a statement: every equation holds at all times",
+            "write `F = if v > 0 then a else b`; states that switch are a `mode`",
+        ),
+        "end" | "endif" | "endfunction" if first + 1 >= piece.end || ends || source.marks[first + 1].first_on_line => {
+            (WordMistake::BlockEnd, "a block ends with `}`", "remove it, or write `}`")
+        }
+        _ => return None,
+    };
+    Some(Diagnostic::error("E0001", message).label(source.span(first), "").help(help).about_word(mistake))
 }
 
 /// Reports `if` without `then` or `else`.
@@ -672,11 +786,7 @@ fn neighbours(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> 
         let error = Diagnostic::error("E0111", "`inf` has no unit");
         return Some(error.label(source.span(at), "").help("leave the unit out: `inf` fits every quantity"));
     }
-    let right = match (source.word(at), source.is_symbol(at + 1, "(")) {
-        ("(", _) => "(...)".to_string(),
-        (word, true) if source.kind(at) == Some(TokenKind::Word) => format!("{word}(...)"),
-        (word, _) => word.to_string(),
-    };
+    let right = operand_at(source, at);
     Some(
         Diagnostic::error("E0111", format!("an operator is missing before `{}`", source.word(at)))
             .label(source.span(at), "")
@@ -790,6 +900,31 @@ fn plain(source: &Source, piece: Piece, stop: &Stop) -> Diagnostic {
     Diagnostic::error("E0001", format!("`{shown}` does not fit here"))
         .label(source.span(stop.at), wanted)
         .about_word(WordMistake::Misfit)
+}
+
+/// The operand that begins at `at`, as far as a message needs it: a number with sign and unit, a path, a call.
+pub(crate) fn operand_at(source: &Source, at: usize) -> String {
+    let mut last = at;
+    if source.is_symbol(last, "-") {
+        last += 1;
+    }
+    let first = last;
+    if source.kind(last) == Some(TokenKind::Number) && source.kind(last + 1) == Some(TokenKind::Unit) {
+        last += 1;
+    }
+    while source.is_symbol(last + 1, ".") && source.kind(last + 2) == Some(TokenKind::Word) {
+        last += 2;
+    }
+    if last >= source.marks.len() {
+        return String::new();
+    }
+    let called = source.kind(first) == Some(TokenKind::Word) && source.is_symbol(last + 1, "(");
+    let text = slice(source, at, last);
+    match source.word(first) {
+        "(" => format!("{}...)", slice(source, at, first)),
+        _ if called => format!("{text}(...)"),
+        _ => text.to_string(),
+    }
 }
 
 /// The operand that ends before `at`, if it is short enough for a message.

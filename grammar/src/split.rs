@@ -413,7 +413,9 @@ impl<'t> Source<'t> {
         }
         if let Some(equals) = self.behind_path(at).filter(|&mark| self.is_symbol(mark, "=")) {
             let derivative = equals > at + 1 && self.is_symbol(at + 1, "/");
-            let listed = self.is_word(first, "safe") && before == ",";
+            let case = matches!(self.word(first), "expect" | "show")
+                && (before == "for" || before == "," && (first..at).any(|mark| self.is_word(mark, "for")));
+            let listed = case || self.is_word(first, "safe") && before == ",";
             return !head && !listed && begins(ended || derivative);
         }
         !inside && fresh && ended && !CONTINUATIONS.contains(&word)

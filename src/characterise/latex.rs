@@ -39,6 +39,7 @@ pub fn tables(studies: &[Study]) -> String {
             out += match study.findings.get(row).map(|finding| finding.seen) {
                 Some(Seen::Shown) => " & $\\checkmark$",
                 Some(Seen::NotShown) => " & $\\times$",
+                Some(Seen::NotRun) => " & ?",
                 Some(Seen::NotApplicable) | None => " & --",
             };
         }

@@ -68,7 +68,7 @@ fn family(args: &Characterise, over: &Vary, terminal: &mut Terminal) -> End {
         };
         for (subject, own) in found {
             let label = subject.instance.label();
-            match study(subject, &battery_in(&own), &project::Disk, Extent::Whole) {
+            match study(subject, &battery_in(&own), &crate::disk::Disk, Extent::Whole) {
                 Ok(study) => studies.push(study),
                 Err(why) => end = failed(terminal, &format!("{label} {why}")),
             }

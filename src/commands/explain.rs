@@ -2,7 +2,7 @@
 
 use super::End;
 use crate::args::Explain;
-use crate::compile::{self, Explanation, Method, Stopwatch, Verdict};
+use crate::compile::{self, Changes, Explanation, Method, Stopwatch, Verdict};
 use crate::quantity::duration;
 use crate::report;
 use crate::terminal::{Style, Terminal};
@@ -51,21 +51,36 @@ pub(super) fn no_page(subject: &str) -> String {
 /// Most models listed in a message.
 const MOST_NAMED: usize = 8;
 
-/// Explains the models of a file, or models that it imports.
+/// Explains the models of a file, models that it imports, experiments and rigs.
 fn models(args: &Explain, terminal: &mut Terminal) -> End {
     let mut watch = Stopwatch::start("read");
-    let Some(loaded) = super::load(Path::new(&args.subject), terminal, &mut watch) else { return End::Failed };
+    let Some(mut loaded) = super::load(Path::new(&args.subject), terminal, &mut watch) else { return End::Failed };
     let all: Vec<String> = loaded.models().into_iter().map(|model| model.name.text.clone()).collect();
-    let wanted = if args.models.is_empty() { &all } else { &args.models };
+    let experiments: Vec<String> = loaded.experiments().into_iter().map(|experiment| experiment.name).collect();
+    let rigs: Vec<String> = loaded.rigs().into_iter().map(|rig| rig.name.text.clone()).collect();
+    let wanted = if args.names.is_empty() { &all } else { &args.names };
     if wanted.is_empty() {
-        terminal.error(&format!("{} has no model", args.subject));
+        let others: Vec<&str> = experiments.iter().chain(&rigs).map(String::as_str).collect();
+        let help = match others.as_slice() {
+            [] => String::new(),
+            [first, ..] => format!("; `fric explain {} {first}` explains what that runs", args.subject),
+        };
+        terminal.error(&format!("{} has no model{help}", args.subject));
         return End::Failed;
     }
     let mut end = End::Fine;
     for name in wanted {
-        let imported = !all.contains(name) && loaded.model_named(name).is_some();
-        if !all.contains(name) && !imported {
-            let help = match compile::nearest(name, all.iter().map(String::as_str)) {
+        let explained = if all.contains(name) {
+            compile::explain(&loaded, &crate::disk::Disk, name)
+        } else if experiments.contains(name) {
+            compile::explain_run(&mut loaded, &crate::disk::Disk, name, &Changes::default())
+        } else if rigs.contains(name) {
+            compile::explain_rig(&mut loaded, &crate::disk::Disk, name)
+        } else if loaded.model_named(name).is_some() {
+            compile::explain_in(&loaded, &crate::disk::Disk, name, loaded.root())
+        } else {
+            let others = experiments.iter().chain(&rigs).chain(&all).map(String::as_str);
+            let help = match compile::nearest(name, others) {
                 Some(near) => format!("did you mean `{near}`?"),
                 None if all.len() > MOST_NAMED => {
                     format!("it has {} and {} more", all[..MOST_NAMED].join(", "), all.len() - MOST_NAMED)
@@ -73,20 +88,26 @@ fn models(args: &Explain, terminal: &mut Terminal) -> End {
                 None if all.is_empty() => "it has none, and imports none of this name".into(),
                 None => format!("it has {}, and imports none of this name", all.join(", ")),
             };
-            terminal.error(&format!("{} has no model `{name}`; {help}", args.subject));
+            terminal.error(&format!("{} has no model, experiment or rig `{name}`; {help}", args.subject));
             end = End::Failed;
             continue;
-        }
-        let explained = match imported {
-            true => compile::explain_in(&loaded, &crate::disk::Disk, name, loaded.root()),
-            false => compile::explain(&loaded, &crate::disk::Disk, name),
         };
         match explained {
             Ok(explanation) => {
-                let bounds = if args.step && !imported { bounds(&loaded, &explanation) } else { Vec::new() };
+                let bounds = match args.step && all.contains(name) {
+                    true => bounds(&loaded, &explanation),
+                    false => Vec::new(),
+                };
+                let explanation = match experiments.contains(name) || rigs.contains(name) {
+                    true => Explanation { model: format!("{name}: {}", explanation.model), ..explanation },
+                    false => explanation,
+                };
                 match args.json {
                     true => terminal.line(&as_json(&explanation, &bounds).to_string()),
                     false => tell(&explanation, &bounds, terminal),
+                }
+                if args.step && !all.contains(name) {
+                    terminal.report("`--step` times the models of the file itself only\n");
                 }
             }
             Err(diagnostics) => {
@@ -169,15 +190,8 @@ pub(super) fn tell(explanation: &Explanation, bounds: &[Bound], terminal: &mut T
 
 /// `euler 20 µs, rk4 28 µs, expo any, implicit any`; none for a model without states to integrate.
 fn stable_steps(explanation: &Explanation) -> Option<String> {
-    let one = |step: &compile::StepCost| {
-        let most = step.stable?;
-        let most = match most {
-            0.0 => "none".into(),
-            most if most >= compile::LONGEST_STEP => "any".into(),
-            most => duration(most, 2),
-        };
-        Some(format!("{} {most}", step.method.name()))
-    };
+    let one =
+        |step: &compile::StepCost| Some(format!("{} {}", step.method.name(), compile::stable_up_to(step.stable?)));
     let all: Option<Vec<String>> = explanation.steps.iter().map(one).collect();
     all.map(|all| all.join(", "))
 }

@@ -182,7 +182,7 @@ fn chosen_rig(file: &Path, name: Option<&str>, loaded: &Loaded) -> Result<String
 /// Refuses and reports errors of `fric check` in the models of a text; prints the number of warnings in one line.
 fn sound(loaded: &Loaded, quiet: bool, terminal: &Terminal, watch: &mut Stopwatch) -> Result<(), Vec<Diagnostic>> {
     watch.stage("models");
-    let found = compile::check_models(loaded, &crate::disk::Disk);
+    let found = compile::check_declarations(loaded, &crate::disk::Disk);
     if found.iter().any(Diagnostic::is_error) {
         reported(loaded, &found, terminal);
         return Err(found);

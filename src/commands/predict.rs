@@ -48,6 +48,15 @@ pub fn predict(args: &Args, terminal: &mut Terminal) -> End {
         all.push(object);
         stable &= holds;
     }
+    if ready.rig.predict.is_none() && !contacts.is_empty() {
+        let one = |contact: &Contact| {
+            let tau = 0.5 * ready.rig.period_ns as f64 * 1e-9 + contact.late.dead + contact.late.lag;
+            format!("`predict {}` lets commands look {} ms ahead", contact.drive, significant(1e3 * tau, 3))
+        };
+        let all: Vec<String> = contacts.iter().map(one).collect();
+        let which = if all.len() > 1 { "; a rig has one of them" } else { "" };
+        words += &format!("            {}{which}\n", all.join(", or "));
+    }
     if contacts.is_empty() {
         words += "stability   no drive emulates a contact: no torque answers the speed of the shaft\n";
     }
@@ -258,13 +267,6 @@ fn advised(ready: &Ready, contact: &Contact, tau: f64) -> (String, Value) {
             json!({"param": damper.path, "value": value, "best": best * value, "limit": total}),
         );
     }
-    if ready.rig.predict.is_none() {
-        words += &format!(
-            "            `predict {}` lets commands look {} ms ahead\n",
-            contact.drive,
-            significant(1e3 * tau, 3)
-        );
-    }
     (words, Value::Object(out))
 }
 
@@ -318,13 +320,20 @@ fn resolution(ready: &Ready) -> (String, Value) {
 fn step_time(ready: &Ready) -> (String, Value) {
     let (median, greatest) = watches::step_time(&ready.rig, &ready.control);
     let period = ready.rig.period_ns as f64 * 1e-9;
-    let words = format!(
+    let mut words = format!(
         "step        {} here, at most {}, of {}\n",
         crate::quantity::duration(median, 3),
         crate::quantity::duration(greatest, 3),
         crate::quantity::duration(period, 3)
     );
-    (words, json!({"median": median, "greatest": greatest, "period": period}))
+    let ends: Vec<Slot> = ready.rig.stops.iter().map(|stop| stop.slot).collect();
+    let stable = compile::largest_stable(&ready.program, &ends, ready.rig.method);
+    if let Some(stable) = stable {
+        let step = crate::quantity::duration(period / f64::from(ready.rig.steps), 3);
+        let most = compile::stable_up_to(stable);
+        words += &format!("            {} takes {step}, largest stable step {most}\n", ready.rig.method.name());
+    }
+    (words, json!({"median": median, "greatest": greatest, "period": period, "largest_stable": stable}))
 }
 
 /// Each contact alone compared with the emulated one, in a standard set of motions.

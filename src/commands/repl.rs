@@ -177,7 +177,7 @@ impl Prompt<'_> {
     }
 
     /// Prints the quantities of a part with their values.
-    fn values(&mut self, values: Vec<(crate::compile::Listed, Value)>) {
+    fn values(&mut self, values: Vec<(crate::compile::QuantityInfo, Value)>) {
         let width = values.iter().map(|(q, _)| q.path.chars().count()).max().unwrap_or(0);
         for (q, value) in values {
             self.terminal.line(&format!("  {:<6} {:width$}  {}", q.kind, q.path, plain(&value)));

@@ -40,7 +40,7 @@ pub fn read(name: &str, text: &str, experiment: &str, method: Method) -> Result<
         _ => false,
     });
     let step = (method != Method::Adaptive && !has_step).then_some(STEP);
-    let changes = Changes { method: Some(method), step, ..Changes::default() };
+    let changes = Changes { method: Some(method), step, any_step: true, ..Changes::default() };
     let read = compiler::experiment::read(&mut loaded, &sources, experiment, &changes, &mut Vec::new(), &mut |_| ());
     let variants = read?;
     let own = variants.first().map_or(0.0, |variant| variant.experiment.solver.step);
@@ -54,7 +54,7 @@ pub fn read(name: &str, text: &str, experiment: &str, method: Method) -> Result<
 pub fn model(name: &str, text: &str, model: &str, method: Method, step: f64) -> Result<Program, Vec<Diagnostic>> {
     let sources = Texts::default();
     let mut loaded = compiler::load(name, text, &sources);
-    let changes = Changes { method: Some(method), step: Some(step), ..Changes::default() };
+    let changes = Changes { method: Some(method), step: Some(step), any_step: true, ..Changes::default() };
     let built = compiler::build(&mut loaded, &sources, model, &changes, &mut Vec::new());
     built.map(|built| built.program)
 }

@@ -38,6 +38,105 @@ const SLIPS: &[(&str, &str, &str)] = &[
         "leave the unit out",
         "model A { input v [m/s] = inf  output o [m/s] = v }",
     ),
+    // Habits of MATLAB and Python: docs/from-matlab.md.
+    (
+        "model A { input v [m/s]  output F [N] = 300 N*s/m*v }",
+        "put a blank before the `*`: `N*s/m * v`",
+        "model A { input v [m/s]  output F [N] = 300 N*s/m * v }",
+    ),
+    (
+        "model A { input v [m/s]  output F [N] = 316 Ns/m * v }",
+        "between units write `·`: `N·s/m`",
+        "model A { input v [m/s]  output F [N] = 316 N·s/m * v }",
+    ),
+    (
+        "model A { input v [m/s]  output F [N] = 0.4 N s/m * v }",
+        "write `0.4 N·s/m`",
+        "model A { input v [m/s]  output F [N] = 0.4 N·s/m * v }",
+    ),
+    (
+        "model A { input v [m/s]  param k = 2 N·s/m  output F [N] = k .* v }",
+        "write `*`",
+        "model A { input v [m/s]  param k = 2 N·s/m  output F [N] = k * v }",
+    ),
+    (
+        "model A { input v [m/s]  param k = [1 2 3] N·s/m\n  output F [N] = 1 N·s/m * v }",
+        "the values of a sweep `sweep k = 1 N/m, 2 N/m`",
+        "model A { input v [m/s]  param k = 1 N·s/m\n  output F [N] = k * v }",
+    ),
+    (
+        "model A {\n  input v [m/s] % the velocity\n  output F [N] = 1 N·s/m * v\n}",
+        "a comment begins with `//`",
+        "model A {\n  input v [m/s] // the velocity\n  output F [N] = 1 N·s/m * v\n}",
+    ),
+    (
+        "model A {\n  input v [m/s]\n  output F [N]\n  if v > 0 m/s\n    F = 1 N\n  else\n    F = -1 N\n  end\n}",
+        "write `F = if v > 0 then a else b`",
+        "model A {\n  input v [m/s]\n  output F [N]\n  F = if v > 0 m/s then 1 N else -1 N\n}",
+    ),
+    (
+        "model A { input v [m/s]  output F [N] = if 0 m/s < v < 1 mm/s then 1 N else 2 N }",
+        "write `0 m/s < v and v < 1 mm/s`",
+        "model A { input v [m/s]  output F [N] = if 0 m/s < v and v < 1 mm/s then 1 N else 2 N }",
+    ),
+    (
+        "experiment e {\n  run SpringBench() for 1 s\n  plot(t, x)\n}",
+        "over time write `plot x`",
+        "experiment e {\n  run SpringBench() for 1 s\n  plot x\n}",
+    ),
+    (
+        "experiment e {\n  run SpringBench() for 1 s\n  plot(v, F)\n}",
+        "write `plot F against v`",
+        "experiment e {\n  run SpringBench() for 1 s\n  plot F against v\n}",
+    ),
+    (
+        "experiment e {\n  run SpringBench() for 1 s\n  [t, x] = ode45(f, 10)\n}",
+        "it chooses its steps itself",
+        "experiment e {\n  run SpringBench() for 1 s\n  plot x\n}",
+    ),
+    (
+        "experiment e { run SpringBench() for 1 s  expect max(F) = 1 N }",
+        "`expect max(F) ~= 1 N +- 1 %`",
+        "experiment e { run SpringBench() for 1 s  expect max(F) ~= 1 N +- 1 % }",
+    ),
+    (
+        "model A { input x [m]  output y [m] = prev(x) }",
+        "in `every Ts { next(y1) = y }`",
+        "model A { input x [m]  state y1 [m] = 0  every 1 ms { next(y1) = x }  output y [m] = y1 }",
+    ),
+    (
+        "model A { param chi = 0.5  let norm = 0.2^(1 + chi)  part b = Coulomb(v = 1 m/s, Fc = norm * 1 N)  output F [N] = b.F }",
+        "write `param norm` in place of `let norm`",
+        "model A { param chi = 0.5  param norm = 0.2^(1 + chi)  part b = Coulomb(v = 1 m/s, Fc = norm * 1 N)  output F [N] = b.F }",
+    ),
+    // What can be zero is named, and no velocity is declared positive.
+    (
+        "model A { input v [m/s]  input T [K] = 300 K  param alpha = 0.01 1/K  let soft = 1 - alpha * (T - 293 K)  output F [N] = 1 N·s/m * v / soft }",
+        "`max(1 - alpha * (T - 293 K), 0.001)`",
+        "model A { input v [m/s]  input T [K] = 300 K  param alpha = 0.01 1/K  let soft = max(1 - alpha * (T - 293 K), 0.001)  output F [N] = 1 N·s/m * v / soft }",
+    ),
+    (
+        "model A { input v [m/s]  output P [N] = 1 W / v }",
+        "`if abs(v) > 0.001 m/s then … / v else …`",
+        "model A { input v [m/s]  output P [N] = if abs(v) > 0.001 m/s then 1 W / v else 0 N }",
+    ),
+    // An unknown warning is allowed nowhere.
+    (
+        "experiment e { run SpringBench() for 1 s  plot x  allow chater \"why\" }",
+        "did you mean `chatter`?",
+        "experiment e { run SpringBench() for 1 s  plot x  allow chatter \"why\" }",
+    ),
+    // Sweeps and their cases.
+    (
+        "experiment e { run SpringBench() for 1 s  sweep vp = 0 m/s .. 1 m/s log 3  expect max(x) < 1 m }",
+        "write `lin` in place of `log`",
+        "experiment e { run SpringBench() for 1 s  sweep vp = 0 m/s .. 1 m/s lin 3  expect max(x) < 9 m }",
+    ),
+    (
+        "experiment e { run SpringBench() for 1 s  sweep vp = 0.1 m/s, 0.2 m/s  expect max(x) < 1 m for vp = 0.3 m/s }",
+        "the sweep has vp = 0.1 m/s, 0.2 m/s",
+        "experiment e { run SpringBench() for 1 s  sweep vp = 0.1 m/s, 0.2 m/s  expect max(x) < 1 m for vp = 200 mm/s }",
+    ),
     // Parts, slots and their arguments.
     (
         "experiment e { run SpringBench(fr = LuGre) for 1 s  expect max(x) < 1 m }",

@@ -162,7 +162,7 @@ pub fn agree(loaded: &mut Loaded, sources: &Texts, experiment: &str) -> Result<(
         .map_or(0.0, |(case, _)| case.experiment.solver.step);
     let step = if own > 0.0 { own } else { 1e-3 };
     for method in Method::ALL.into_iter().filter(|method| *method != Method::Adaptive) {
-        let changes = Changes { method: Some(method), step: Some(step), ..Changes::default() };
+        let changes = Changes { method: Some(method), step: Some(step), any_step: true, ..Changes::default() };
         for (machine, interpreted) in both(loaded, sources, experiment, changes)? {
             let (mut a, mut b) = (machine.instance, interpreted.instance);
             let statuses = [a.start(step), b.start(step)];

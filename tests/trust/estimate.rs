@@ -129,7 +129,8 @@ impl Survey<'_> {
             let fixed = match *setting {
                 (Method::Adaptive, _) => None,
                 (method, step) => {
-                    let changes = Changes { method: Some(method), step: Some(step), ..Changes::default() };
+                    let changes =
+                        Changes { method: Some(method), step: Some(step), any_step: true, ..Changes::default() };
                     let Some(cases) = compiled(&mut loaded, &subject.name, changes) else { continue };
                     Some(cases)
                 }

@@ -9,6 +9,7 @@ use crate::frontend::units::Types;
 use crate::functions::{Domain, Unary};
 use crate::interval::planted;
 use crate::ranges::reach::{Reach, whole};
+use abi::unit::{Dimension, Unit};
 use grammar::ast::BinaryOp;
 use grammar::diagnostic::Diagnostic;
 use grammar::span::Span;
@@ -282,20 +283,68 @@ fn division(reach: &mut Reach, types: &Types, files: &Files, divisor: ExprId) ->
         return error.label(here, "here").help(format!("declare `{} {}{default} in > 0`", var.kind.word(), var.name));
     }
     let error = Diagnostic::error("E0601", message).label(here, "not proven to stay away from 0");
-    let free = params.iter().map(|id| system.var(*id)).find(|var| var.range_span.is_none());
-    match (system.node(divisor), free) {
-        (Node::Var(id), _) if matches!(system.var(*id).kind, VarKind::Param | VarKind::Input) => {
-            let var = system.var(*id);
-            error
-                .label(var.span, "declared without a range")
-                .help(format!("declare its range: `{} in > 0`", declaration(system, files, var)))
-        }
-        (_, Some(var)) => error
-            .label(var.span, format!("{} has no range", var.name))
-            .help(format!("declare its range: `{} in > 0`", declaration(system, files, var))),
-        _ => error
-            .help(format!("guard it: `if abs({text}) > … then … / {text} else …`, or keep it away from 0 with `max`")),
+    // A range that would help, for a quantity that is positive by its nature: a velocity has both signs.
+    let free = params.iter().copied().find(|&id| {
+        let var = system.var(id);
+        let dimension = types.units[id.0 as usize].dimension;
+        let signed = var.kind == VarKind::Input && [VELOCITY, ANGULAR_VELOCITY].contains(&dimension);
+        var.range_span.is_none() && !signed && !reach.if_positive(id, divisor).has_zero()
+    });
+    if let Some(id) = free {
+        let var = system.var(id);
+        let label = match system.node(divisor) {
+            Node::Var(own) if *own == id => "declared without a range".to_string(),
+            _ => format!("{} has no range", var.name),
+        };
+        let help = format!("declare its range: `{} in > 0`", declaration(system, files, var));
+        return error.label(var.span, label).help(help);
     }
+    let factor = vanishing_factor(reach, divisor);
+    let (text, whole) = (files.slice(system.span(factor)), factor == divisor);
+    let error = if whole { error } else { error.label(system.span(factor), "this can be zero") };
+    let unit = types.nodes[factor.0 as usize].map_or(String::new(), |dimension| Unit::si(dimension).text);
+    let unit = if unit.is_empty() { unit } else { format!(" {unit}") };
+    let signed = reach.interval(factor);
+    // With a bound on the side where the values are.
+    let bounded = match (signed.low >= 0.0, signed.high <= 0.0) {
+        (_, true) if signed.low < 0.0 => format!("min({text}, -0.001{unit})"),
+        _ => format!("max({text}, 0.001{unit})"),
+    };
+    let named = matches!(system.node(factor), Node::Var(_));
+    error.help(match named && !(signed.low >= 0.0 || signed.high <= 0.0) {
+        // A quantity of both signs has no bound on one side.
+        true => format!("keep it away from 0, for example `if abs({text}) > 0.001{unit} then … / {text} else …`"),
+        false => format!("keep it away from 0, for example `{bounded}`"),
+    })
+}
+
+const VELOCITY: Dimension = Dimension::of([0, 1, -1, 0, 0]);
+const ANGULAR_VELOCITY: Dimension = Dimension::of([0, 0, -1, 0, 0]);
+
+/// The factor of a divisor that can be zero: the divisor itself unless it is a product, a power or a name for one.
+fn vanishing_factor(reach: &mut Reach, divisor: ExprId) -> ExprId {
+    let system = reach.system();
+    let mut at = divisor;
+    for _ in 0..64 {
+        at = match *system.node(at) {
+            Node::Binary(BinaryOp::Multiply, a, b) => {
+                if reach.interval(a).has_zero() {
+                    a
+                } else {
+                    b
+                }
+            }
+            Node::Binary(BinaryOp::Divide | BinaryOp::Power, a, _) => a,
+            Node::Negate(a) => a,
+            Node::Fits { value, .. } => value,
+            Node::Var(id) => match system.var(id).definition {
+                Definition::Value(value, _) if matches!(system.var(id).kind, VarKind::Let | VarKind::Output) => value,
+                _ => return at,
+            },
+            _ => return at,
+        };
+    }
+    at
 }
 
 /// The span extended to the `/` before it.

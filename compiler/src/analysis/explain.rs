@@ -4,7 +4,7 @@
 //! In: a flat and typed system. Out: plain data; knows nothing of its presentation.
 
 use crate::analysis::dissipation::{self, Verdict};
-use crate::analysis::step_stability::Bench;
+use crate::analysis::step_stability::largest_stable;
 use crate::codegen::target::{FunctionCompiler, here};
 use crate::frontend::causality::{Phase, rate_of, value_of};
 use crate::frontend::source::Files;
@@ -14,11 +14,10 @@ use crate::ir::build::{Build, Env};
 use crate::ir::expr::Shared;
 use crate::ir::program::Program;
 use crate::ir::{Func, Op, Value};
-use crate::lower::{Lowered, lower};
 use crate::numerics::{autodiff, fixed_step};
 use crate::opt::reassociate::reassociate;
 use abi::description::Slot;
-use abi::format::{duration, three_digits};
+use abi::format::three_digits;
 use abi::plan::Method;
 use grammar::ast::BinaryOp;
 use grammar::span::Span;
@@ -62,8 +61,8 @@ pub struct StepCost {
     /// Instructions and bytes of the machine code for this processor; `None` if there is none.
     pub code: Option<(usize, usize)>,
     /// The largest stable step in s over the declared ranges, with open ranges up to
-    /// [`OPEN`](crate::analysis::step_stability::OPEN). It is [`LONGEST`](crate::analysis::step_stability::LONGEST) if
-    /// every step is stable, and 0 if none is. `None` without continuous states, or with too many.
+    /// [`OPEN`](crate::analysis::step_stability::OPEN): see [`largest_stable`]. `None` without continuous states, or
+    /// with too many.
     pub stable: Option<f64>,
 }
 
@@ -110,11 +109,24 @@ pub enum SelfDependence {
 /// A step in s for sizing the delay buffers, on which the size of the block depends.
 const EXAMPLE_STEP: f64 = 1e-3;
 
-/// Explains a model on its own.
-pub fn explain(system: &System, types: &Types, files: &Files) -> Explanation {
-    let Lowered { mut program, .. } = lower(system, types, &[]);
-    program.size_rings(EXAMPLE_STEP);
-    let bench = Bench::new(&program, &[]);
+/// Explains a model on its own, or the system of an experiment or rig. `judged`: the program on whose steps stability
+/// is judged, if it is another one, and its outputs that are not 0 where a run ends.
+pub fn explain(
+    system: &System,
+    types: &Types,
+    program: &Program,
+    judged: (Option<&Program>, &[Slot]),
+    files: &Files,
+) -> Explanation {
+    let stepped = |program: &Program| {
+        let mut program = program.clone();
+        if program.description.delays.iter().any(|delay| delay.ring.len == 0) {
+            program.size_rings(EXAMPLE_STEP);
+        }
+        program
+    };
+    let (given, ends) = (stepped(judged.0.unwrap_or(program)), judged.1);
+    let program = stepped(program);
     let steps = Method::fixed().map(|method| {
         let step = fixed_step::step(&program, method);
         let expanded = crate::math::expand(&step);
@@ -125,7 +137,7 @@ pub fn explain(system: &System, types: &Types, files: &Files) -> Explanation {
             operations: expanded.ops.len(),
             divisions,
             code: code_size(&crate::math::expand(&reassociate(&step, program.balanced))),
-            stable: bench.as_ref().map(|bench| bench.largest_stable(method)),
+            stable: largest_stable(&given, ends, method),
         }
     });
     Explanation {
@@ -420,12 +432,7 @@ impl Stepped {
         };
         if let Some((rate, at)) = self.fastest {
             let at = at.map_or(String::new(), |v| format!(" at v = {} m/s", three_digits(v)));
-            text += &format!(
-                "; own rate {} 1/s{at}, where euler needs steps below {} and rk4 below {}",
-                three_digits(rate),
-                duration(2.0 / rate, 3),
-                duration(2.785 / rate, 3)
-            );
+            text += &format!("; own rate {} 1/s{at}", three_digits(rate));
         }
         text
     }

@@ -30,9 +30,15 @@ fn constants(system: &System, diagnostics: &mut Vec<Diagnostic>) {
         let Definition::Value(value, origin) = &var.definition else { continue };
         let Some(moving) = moving(system, *value) else { continue };
         let error =
-            Diagnostic::error("E0502", format!("`{}` is a param: it is constant while the model runs", var.name))
-                .label(system.span(moving), "changes")
-                .label(var.span, "declared here");
+            Diagnostic::error("E0502", format!("`{}` is a param: it is constant while the model runs", var.name));
+        if let Some(fixed) = constant_let(system, moving) {
+            let error = error
+                .label(system.span(moving), "a `let` counts as changing")
+                .label(fixed.span, "depends on params only");
+            diagnostics.push(error.help(format!("write `param {0}` in place of `let {0}`", fixed.name)));
+            continue;
+        }
+        let error = error.label(system.span(moving), "changes").label(var.span, "declared here");
         diagnostics.push(match origin {
             Origin::Argument { .. } => error.help(format!("declare `{}` as an input of that model", var.name)),
             _ => error.help(format!("declare `{}` with `let`", var.name)),
@@ -47,6 +53,27 @@ fn constants(system: &System, diagnostics: &mut Vec<Diagnostic>) {
             );
         }
     }
+}
+
+/// The quantity that an expression names, if it is a `let` whose value depends on params and on such `let` alone.
+fn constant_let(system: &System, id: ExprId) -> Option<&Var> {
+    fn is_constant(system: &System, id: ExprId, depth: u32) -> bool {
+        match system.node(id) {
+            Node::Var(var) => {
+                let var = system.var(*var);
+                match (var.kind, &var.definition) {
+                    (VarKind::Param, _) => true,
+                    (VarKind::Let, Definition::Value(value, _)) => depth < 64 && is_constant(system, *value, depth + 1),
+                    _ => false,
+                }
+            }
+            Node::Time | Node::Rate(_) | Node::PathRate(_) | Node::InRegime(..) => false,
+            node => node.operands().all(|operand| is_constant(system, operand, depth)),
+        }
+    }
+    let Node::Var(var) = system.node(id) else { return None };
+    let var = system.var(*var);
+    (var.kind == VarKind::Let && is_constant(system, id, 0)).then_some(var)
 }
 
 /// The part of an expression that changes during a run, if there is one.

@@ -10,6 +10,7 @@
 //! cause no false alarms. The work is bounded by operations rather than time, so the result does not depend on the
 //! machine.
 
+use crate::analysis::memo::Memo;
 use crate::ir::Func;
 use crate::ir::build::{Build, Env};
 use crate::ir::expr::Shared;
@@ -21,6 +22,7 @@ use crate::numerics::fixed_step;
 use abi::Slot;
 use abi::description::{Kind, Quantity};
 use abi::plan::Method;
+use std::cell::OnceCell;
 
 /// Limit on the number of continuous states of an analysed program.
 pub const MOST_STATES: usize = 48;
@@ -34,6 +36,8 @@ const RUN: usize = 200;
 const FINER: usize = 16;
 /// Factor by which the confirming run must go farther than the reference run.
 const FARTHER: f64 = 10.0;
+/// Most numbers in the block of a confirming run: delays much longer than the step need more, and are not run.
+const MOST_SLOTS: usize = 2_000_000;
 /// Number of steps of the run that confirms chattering, and the number of reversals required in its second half.
 const CHATTER: (usize, usize) = (256, 8);
 /// Number of steps, and their length in s, in which fast states relax to their quasi-steady values.
@@ -44,8 +48,11 @@ pub const OPEN: f64 = 10.0;
 const EIGHTHS: [f64; 8] = [1.0, 1.3335, 1.7783, 2.3714, 3.1623, 4.2170, 5.6234, 7.4989];
 /// Exponent of ten up to which the search looks for a condition that ends the run.
 const FAR: i32 = 4;
-/// The longest step in s that is tried.
+/// The longest step in s that is tried, and the shortest.
 pub const LONGEST: f64 = 1.0;
+const SHORTEST: f64 = 1e-8;
+/// Limit on interpreted operations for each step length of the search for the largest stable one.
+const SEARCH_WORK: usize = WORK / 40;
 
 /// Result: a step that is numerically unstable.
 #[derive(Clone, PartialEq, Debug)]
@@ -57,8 +64,6 @@ pub struct Unstable {
     /// The state or input on whose magnitude the instability depends; `None` if the step is unstable at the start
     /// point.
     pub along: Option<StabilityLimit>,
-    /// The largest stable step at the worst point, in s.
-    pub stable: f64,
 }
 
 /// A quantity along which a step becomes unstable.
@@ -99,7 +104,6 @@ pub struct Singular {
 /// Evaluates a program at points of its ranges.
 pub struct Bench<'a> {
     program: &'a Program,
-    start: Func,
     outputs: Func,
     derivatives: Func,
     /// ∂f/∂x, row-major, stored after the block.
@@ -111,6 +115,8 @@ pub struct Bench<'a> {
     n: usize,
     /// The block at the start point.
     base: Vec<f64>,
+    /// The points of all scans, which depend on neither method nor step.
+    scanned: OnceCell<Vec<Scanned>>,
 }
 
 /// The derivative of a method's fixed step with respect to the states.
@@ -125,6 +131,47 @@ struct Scan {
     closed: bool,
 }
 
+/// The points of one scan in which a run has not ended.
+struct Scanned {
+    scan: Scan,
+    points: Vec<Point>,
+    /// Whether a condition that ends the run bounds the scan, or its range does.
+    closed: bool,
+    /// The greatest magnitude among the points.
+    farthest: f64,
+}
+
+/// A point at which fast states have relaxed.
+struct Point {
+    /// Index of the start block.
+    setting: usize,
+    /// Value of the varied quantity, SI units.
+    value: f64,
+    block: Vec<f64>,
+}
+
+/// The largest step of a method in s that is stable within the ranges of a program, up to [`LONGEST`]; 0 if there is
+/// none. `ends`: outputs that are not 0 where a run ends. `None` for a program that is not analysed
+/// ([`Bench::new`]). This number is the one that diagnostics, explanations and predictions name.
+pub fn largest_stable(program: &Program, ends: &[Slot], method: Method) -> Option<f64> {
+    static KNOWN: Memo<Option<f64>> = Memo::new();
+    let also: Vec<u64> = ends.iter().map(|slot| u64::from(slot.0)).chain([method as u64]).collect();
+    KNOWN.answer(program, &also, || Bench::new(program, ends).map(|bench| bench.largest_stable(method)))
+}
+
+/// A value at which an open input is held while others vary: 0 if that is in its range.
+fn resting((low, high): (f64, f64)) -> f64 {
+    if (low..=high).contains(&0.0) {
+        return 0.0;
+    }
+    match (low.is_finite(), high.is_finite()) {
+        (true, true) => 0.5 * (low + high),
+        // A range such as `in > 0` begins at the smallest number, at which a quotient overflows.
+        (true, false) => low.max(1.0),
+        (false, _) => high.min(-1.0),
+    }
+}
+
 impl<'a> Bench<'a> {
     /// From a program whose ring buffers are sized; `ends`: outputs that are not 0 where a run ends. `None` for a
     /// program without continuous states or with more than [`MOST_STATES`].
@@ -137,11 +184,13 @@ impl<'a> Bench<'a> {
         let start = expand(&program.start);
         let mut base = vec![0.0; layout.size() + n * n];
         base[layout.params.range()].copy_from_slice(&program.params);
+        for input in program.description.quantities.iter().filter(|quantity| quantity.kind == Kind::Input) {
+            base[input.slot.index()] = resting(input.range);
+        }
         run_once(&start, &mut base, &program.description.pool);
         let rows: Vec<Slot> = (0..n).map(|k| layout.derivatives.slot(k)).collect();
         Some(Bench {
             program,
-            start,
             outputs: expand(&program.outputs),
             derivatives: expand(&program.derivatives),
             jacobian: derivative(program, &program.derivatives, &rows),
@@ -149,6 +198,7 @@ impl<'a> Bench<'a> {
             ends: ends.to_vec(),
             n,
             base,
+            scanned: OnceCell::new(),
         })
     }
 
@@ -240,54 +290,81 @@ impl<'a> Bench<'a> {
         Some((growth, state))
     }
 
-    /// The first point found at which a step of this length is unstable, confirmed by a run.
-    pub fn unstable(&self, method: Method, h: f64) -> Option<Unstable> {
-        let stepper = self.stepper(method);
-        let settings = self.settings();
-        let rest: Vec<Vec<f64>> = settings.iter().map(|block| self.relaxed(block.clone())).collect();
-        if let Some((_, state)) = rest.iter().find_map(|block| self.grows(&stepper, block, h)) {
-            let block = &self.base;
-            if rest.iter().any(|block| self.diverges(method, block, h)) {
-                let stable = self.largest(&stepper, block, h);
-                return Some(Unstable { state, rate: self.rate(block, state), along: None, stable });
-            }
-        }
-        let mut work = WORK / self.cost(&stepper);
-        for scan in self.scans() {
-            // Unstable points: (index of the start block, value, growth, state).
-            let mut found: Vec<(usize, f64, f64, usize)> = Vec::new();
-            let (mut closed, mut farthest) = (scan.closed, 0.0_f64);
-            for (at, setting) in settings.iter().enumerate() {
-                for value in &scan.values {
-                    work = work.checked_sub(1)?;
-                    let block = self.at(setting, scan.slot, *value);
-                    if self.ended(&block) {
-                        closed = true;
-                        continue;
-                    }
-                    farthest = farthest.max(value.abs());
-                    let block = self.relaxed(block);
-                    if let Some((growth, state)) = self.grows(&stepper, &block, h) {
-                        found.push((at, *value, growth, state));
+    /// The points of all scans: at most as many as can be examined.
+    fn scanned(&self) -> &[Scanned] {
+        self.scanned.get_or_init(|| {
+            let settings = self.settings();
+            let mut left = WORK / (RELAXING.0 * self.relaxing.ops.len() + self.outputs.ops.len()).max(1);
+            let one = |scan: Scan| {
+                let (mut closed, mut farthest, mut points) = (scan.closed, 0.0_f64, Vec::new());
+                for (setting, start) in settings.iter().enumerate() {
+                    for value in &scan.values {
+                        if left == 0 {
+                            continue;
+                        }
+                        left -= 1;
+                        let block = self.at(start, scan.slot, *value);
+                        if self.ended(&block) {
+                            closed = true;
+                            continue;
+                        }
+                        farthest = farthest.max(value.abs());
+                        points.push(Point { setting, value: *value, block: self.relaxed(block) });
                     }
                 }
+                Scanned { scan, points, closed, farthest }
+            };
+            self.scans().into_iter().map(one).collect()
+        })
+    }
+
+    /// The first point found at which a step of this length is unstable, confirmed by a run.
+    pub fn unstable(&self, method: Method, h: f64) -> Option<Unstable> {
+        self.unstable_within(&self.stepper(method), method, h, WORK)
+    }
+
+    /// As [`unstable`](Self::unstable), with a limit on interpreted operations: of each scan the farthest points are
+    /// examined.
+    fn unstable_within(&self, stepper: &Stepper, method: Method, h: f64, work: usize) -> Option<Unstable> {
+        let settings = self.settings();
+        let rest: Vec<Vec<f64>> = settings.iter().map(|block| self.relaxed(block.clone())).collect();
+        if let Some((_, state)) = rest.iter().find_map(|block| self.grows(stepper, block, h)) {
+            let block = &self.base;
+            if rest.iter().any(|block| self.diverges(method, block, h)) {
+                return Some(Unstable { state, rate: self.rate(block, state), along: None });
             }
+        }
+        let most = (work / self.cost(stepper)).max(1);
+        let all: usize = self.scanned().iter().map(|scanned| scanned.points.len()).sum();
+        for scanned in self.scanned() {
+            let Scanned { scan, points, closed, farthest } = scanned;
+            // An equal share of each scan, if not all of its points can be examined.
+            let count = if all <= most { points.len() } else { (points.len() * most).div_ceil(all) };
+            let mut order: Vec<&Point> = points.iter().collect();
+            order.sort_by(|a, b| b.value.abs().total_cmp(&a.value.abs()));
+            // Unstable points with their growth and state.
+            let found: Vec<(&Point, f64, usize)> = order
+                .into_iter()
+                .take(count)
+                .filter_map(|point| self.grows(stepper, &point.block, h).map(|(growth, state)| (point, growth, state)))
+                .collect();
             // The farthest of the worst points, where a run diverges soonest.
-            let worst =
-                found.iter().max_by(|a, b| a.2.min(1e9).total_cmp(&b.2.min(1e9)).then(a.1.abs().total_cmp(&b.1.abs())));
-            let Some(&(at, value, _, state)) = worst else { continue };
-            let setting = &settings[at];
-            let point = |value: f64| self.relaxed(self.at(setting, scan.slot, value));
-            if !self.diverges(method, &point(value), h) {
+            let worst = found
+                .iter()
+                .max_by(|a, b| a.1.min(1e9).total_cmp(&b.1.min(1e9)).then(a.0.value.abs().total_cmp(&b.0.value.abs())));
+            let Some(&(worst, _, state)) = worst else { continue };
+            let (setting, value) = (&settings[worst.setting], worst.value);
+            if !self.diverges(method, &worst.block, h) {
                 continue;
             }
+            let point = |value: f64| self.relaxed(self.at(setting, scan.slot, value));
             // Bisects for the limit with the same start block and sign, between the last stable and the first unstable
             // value.
             let same = |x: &f64| x.signum() == value.signum();
             let first = found
                 .iter()
-                .filter(|f| f.0 == at && same(&f.1))
-                .map(|f| f.1)
+                .filter(|(point, ..)| point.setting == worst.setting && same(&point.value))
+                .map(|(point, ..)| point.value)
                 .min_by(|a, b| a.abs().total_cmp(&b.abs()));
             let (mut high, start) = (first.unwrap_or(value), self.base[scan.slot.index()]);
             let below = scan.values.iter().filter(|x| same(x) && x.abs() < high.abs());
@@ -296,7 +373,7 @@ impl<'a> Bench<'a> {
             let (least, mut low) = (high, below.unwrap_or(start));
             for _ in 0..40 {
                 let middle = 0.5 * (low + high);
-                match self.grows(&stepper, &point(middle), h) {
+                match self.grows(stepper, &point(middle), h) {
                     Some(_) => high = middle,
                     None => low = middle,
                 }
@@ -304,12 +381,11 @@ impl<'a> Bench<'a> {
             // The condition that ends the run may change between two powers of ten.
             let edge = match inward {
                 true => least,
-                false => self.edge(setting, scan.slot, farthest.copysign(value), &scan),
+                false => self.edge(setting, scan.slot, farthest.copysign(value), scan),
             };
-            let block = point(edge);
-            let along = StabilityLimit { slot: scan.slot, limit: low.abs(), farthest: edge.abs(), inward, closed };
-            let stable = self.largest(&stepper, &block, h);
-            return Some(Unstable { state, rate: self.rate(&block, state), along: Some(along), stable });
+            let along =
+                StabilityLimit { slot: scan.slot, limit: low.abs(), farthest: edge.abs(), inward, closed: *closed };
+            return Some(Unstable { state, rate: self.rate(&point(edge), state), along: Some(along) });
         }
         None
     }
@@ -406,70 +482,30 @@ impl<'a> Bench<'a> {
             + 40 * self.n.pow(3)
     }
 
-    /// The largest step below h that is stable at a point, by bisection.
-    fn largest(&self, stepper: &Stepper, block: &[f64], h: f64) -> f64 {
-        let stable = |h: f64| self.grows(stepper, block, h).is_none();
-        let mut low = h;
-        for _ in 0..40 {
-            low *= 0.5;
-            if stable(low) {
-                break;
+    /// The largest step of a method in s for which [`unstable`](Self::unstable) finds nothing, searched upwards, because
+    /// a step beyond the first unstable one is of no use.
+    fn largest_stable(&self, method: Method) -> f64 {
+        let stepper = self.stepper(method);
+        let stable = |h: f64| self.unstable_within(&stepper, method, h, SEARCH_WORK).is_none();
+        if !stable(SHORTEST) {
+            return 0.0;
+        }
+        let mut low = SHORTEST;
+        while low < LONGEST && stable((2.0 * low).min(LONGEST)) {
+            low = (2.0 * low).min(LONGEST);
+        }
+        if low < LONGEST {
+            let mut high = 2.0 * low;
+            for _ in 0..10 {
+                let middle = 0.5 * (low + high);
+                if stable(middle) { low = middle } else { high = middle }
             }
         }
-        let mut high = 2.0 * low;
-        for _ in 0..20 {
-            let middle = 0.5 * (low + high);
-            if stable(middle) { low = middle } else { high = middle }
+        // A large model has more points than each step of this search examines.
+        while low > SHORTEST && self.unstable_within(&stepper, method, low, WORK).is_some() {
+            low *= 0.95;
         }
         low
-    }
-
-    /// Whether deviations grow slightly at any step, as undamped oscillations do with some methods. Called with a
-    /// quarter of the step: whether they still grow although the model does not let them.
-    fn always_grows(&self, stepper: &Stepper, points: &[Vec<f64>], h: f64) -> bool {
-        // Repeated squaring resolves a radius near 1 to about 1e-4, but its error is the same for both matrices.
-        const LEAST: f64 = 4e-5;
-        let growth = |matrix: &[f64]| radius(matrix, self.n, 0.0).map_or(0.0, |(growth, _)| growth);
-        points.iter().any(|block| {
-            let step = growth(&self.matrix(&stepper.derivative, block, h));
-            let model = growth(&exponential(&self.matrix(&self.jacobian, block, h), self.n, h));
-            model < 1.0 + 0.2 * MARGIN && step > model + LEAST
-        })
-    }
-
-    /// The largest step of a method in s that is stable at all points, up to [`LONGEST`]; 0 if there is none.
-    pub fn largest_stable(&self, method: Method) -> f64 {
-        let stepper = self.stepper(method);
-        let settings = self.settings();
-        let mut points = settings.clone();
-        // Powers of ten from 1e-3, and the ends of the ranges; the farthest of each quantity first, because only a
-        // limited number of points of a large model can be examined.
-        let scans = self.scans();
-        let far = |scan: &Scan, k: usize| scan.values.iter().rev().copied().filter(|x| x.abs() >= 0.9e-3).nth(k);
-        let most = scans.iter().map(|scan| scan.values.len()).max().unwrap_or(0);
-        for k in 0..most {
-            for scan in &scans {
-                let Some(value) = far(scan, k) else { continue };
-                points.extend(settings.iter().map(|setting| self.at(setting, scan.slot, value)));
-            }
-        }
-        points.truncate((WORK / 40 / self.cost(&stepper)).max(4 + 6 * scans.len()));
-        let points: Vec<Vec<f64>> = points.into_iter().map(|block| self.relaxed(block)).collect();
-        let stable = |h: f64| points.iter().all(|block| self.grows(&stepper, block, h).is_none());
-        // Searches upwards: a step beyond the first unstable one is of no use.
-        let mut low = 1e-8;
-        while low < LONGEST && stable(2.0 * low) {
-            low *= 2.0;
-        }
-        if low >= LONGEST {
-            return LONGEST;
-        }
-        let mut high = 2.0 * low;
-        for _ in 0..8 {
-            let middle = 0.5 * (low + high);
-            if stable(middle) { low = middle } else { high = middle }
-        }
-        if self.always_grows(&stepper, &points, 0.25 * low) { 0.0 } else { low }
     }
 
     /// Whether a run from near a point leaves the region in which a run with much shorter steps stays.
@@ -514,13 +550,17 @@ impl<'a> Bench<'a> {
         let mut program = self.program.clone();
         program.size_rings(h);
         let layout = &program.description.layout;
+        if layout.size() > MOST_SLOTS {
+            return;
+        }
         let mut at = vec![0.0; layout.size()];
         at[layout.params.range()].copy_from_slice(&program.params);
         for input in layout.inputs.range() {
             at[input] = block[input];
         }
         at[Slot::STEP.index()] = h;
-        run_once(&self.start, &mut at, &program.description.pool);
+        // The start fills the ring buffers, whose length depends on the step.
+        run_once(&expand(&program.start), &mut at, &program.description.pool);
         at[layout.states.range()].copy_from_slice(&block[self.program.description.layout.states.range()]);
         let first = at[layout.states.range()].to_vec();
         let step = expand(&fixed_step::step(&program, method));

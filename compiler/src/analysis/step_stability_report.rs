@@ -6,7 +6,9 @@
 
 use crate::analysis::explain::{SelfDependence, states};
 use crate::analysis::memo::Memo;
-use crate::analysis::step_stability::{Bench, Chatter, Singular, StabilityLimit, Unstable, ten_to};
+use crate::analysis::step_stability::{
+    Bench, Chatter, LONGEST, Singular, StabilityLimit, Unstable, largest_stable, ten_to,
+};
 use crate::frontend::source::Files;
 use crate::frontend::system::*;
 use crate::frontend::units::Types;
@@ -38,13 +40,26 @@ pub struct Fixed<'a> {
     pub run: Span,
     /// Conditions that end a run, and the outputs that hold their values.
     pub ends: &'a [(ExprId, Slot)],
-    /// Whether this is a rig, where `rate` rather than `step` determines the step.
-    pub rig: bool,
+    /// What determines the step.
+    pub by: StepBy,
+    /// Name of the experiment or rig.
+    pub name: &'a str,
+}
+
+/// What determines the length of a step, and so what the user can change.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub enum StepBy {
+    /// `solver` in the text.
+    Text,
+    /// An option of the command: `--solver`, `--step`.
+    Option,
+    /// The `rate` of a rig.
+    Rate,
 }
 
 /// Checks the step; returns at most one diagnostic of each kind.
 pub fn check(fixed: &Fixed, files: &Files) -> Vec<Diagnostic> {
-    let ends: Vec<Slot> = fixed.ends.iter().map(|(_, slot)| *slot).collect();
+    let ends = fixed.ends_at();
     let Some(bench) = Bench::new(fixed.program, &ends) else { return Vec::new() };
     let stable = |method: Method| bench.unstable(method, fixed.step).is_none();
     // A chattering state is also unstable; the jump is the cause.
@@ -58,7 +73,8 @@ pub fn check(fixed: &Fixed, files: &Files) -> Vec<Diagnostic> {
             match (look.then(|| bench.singular(fixed.step)).flatten(), unstable) {
                 (Some(singular), _) => Finding::Singular(singular),
                 (None, Some(unstable)) => {
-                    Finding::Unstable(unstable, fixed.method != Method::Implicit && stable(Method::Implicit))
+                    let implicit = fixed.method != Method::Implicit && stable(Method::Implicit);
+                    Finding::Unstable(unstable, implicit)
                 }
                 (None, None) => Finding::Nothing,
             }
@@ -106,7 +122,10 @@ impl Fixed<'_> {
         };
         let scanned = unstable.along.as_ref().and_then(|along| Some((along, self.name_of(along, var.instance)?)));
         let open = scanned.as_ref().is_some_and(|(along, _)| !along.closed);
-        let needed = duration(unstable.stable, 2);
+        let largest = largest_stable(self.program, &self.ends_at(), self.method).unwrap_or(0.0);
+        // Stability need not be monotonic in the step; this one is known to be too long.
+        let largest = largest.min(0.95 * self.step);
+        let needed = stable_up_to(largest);
 
         let message = match open {
             true => format!("{method} at {step} is a large step for this model"),
@@ -128,17 +147,26 @@ impl Fixed<'_> {
                 let (limit, far) = (amount(along.limit, unit), amount(along.farthest, unit));
                 match (along.inward, open) {
                     (true, _) => {
-                        format!("stable at {step} only for |{name}| >= {limit}; at rest it would need {needed}")
+                        format!(
+                            "stable at {step} only for |{name}| >= {limit}; at rest it would need a step of {needed}"
+                        )
                     }
                     (false, true) => {
                         format!(
                             "stable at {step} only for |{name}| <= {limit}; at {far} it would need a step of {needed}"
                         )
                     }
-                    (false, false) => format!("stable at {step} only for |{name}| <= {limit}"),
+                    (false, false) if self.end(along).is_some() => {
+                        format!("stable at {step} only for |{name}| <= {limit}")
+                    }
+                    (false, false) => {
+                        format!(
+                            "stable at {step} only for |{name}| <= {limit}; up to {far} it would need a step of {needed}"
+                        )
+                    }
                 }
             }
-            None => format!("stable below a step of {needed} only"),
+            None => format!("stable up to a step of {needed} only"),
         };
         out = out.label(self.place, limit);
         if let Some((along, _)) = scanned.as_ref().filter(|(along, _)| along.closed)
@@ -148,21 +176,43 @@ impl Fixed<'_> {
         }
         let derivative = format!("d{}/dt", var.name);
         let file = &files.get(self.place.file).name;
-        let shorter = match self.rig {
-            true => format!("divide the period: `solver {method} step {}`", below(unstable.stable)),
-            false => format!("write `step {}`", below(unstable.stable)),
-        };
+        let shorter = self.shorter(largest);
+        let solver = if self.by == StepBy::Option { "--solver" } else { "solver" };
         let help = match (linear && stiff, implicit) {
             (true, _) => format!(
-                "{derivative} is linear in {}, so `solver expo` steps it exactly at any speed.\n\
-                 `fric explain {file} --step` shows the numbers per state",
-                var.name
+                "{derivative} is linear in {}, so `{solver} expo` steps it exactly at any speed.\n\
+                 `fric explain {file} {}` shows the numbers per state",
+                var.name, self.name
             ),
-            (false, true) => format!("`solver implicit` is stable at this step; or {shorter}"),
-            (false, false) => format!("{shorter}{}", if self.rig { "" } else { ", or leave `solver` out: adaptive" }),
+            (false, true) => format!("`{solver} implicit` is stable at this step; or {shorter}"),
+            (false, false) => format!("{shorter}{}", self.adaptive()),
         };
         let keep = if open { "\nTo keep it: `allow large-step \"...\"`" } else { "" };
         out.help(format!("{help}{keep}"))
+    }
+
+    /// What to write for steps of at most this length.
+    fn shorter(&self, most: f64) -> String {
+        let step = below(most);
+        match self.by {
+            StepBy::Text => format!("write `step {step}`"),
+            StepBy::Option => format!("take `--step {}`", step.replace(' ', "")),
+            StepBy::Rate => format!("divide the period: `solver {} step {step}`", self.method.name()),
+        }
+    }
+
+    /// The other remedy, where steps may have any length.
+    fn adaptive(&self) -> &'static str {
+        match self.by {
+            StepBy::Text => ", or leave `solver` out: adaptive",
+            StepBy::Option => ", or take `--solver adaptive`",
+            StepBy::Rate => "",
+        }
+    }
+
+    /// Slots of the outputs that are not 0 where a run ends.
+    fn ends_at(&self) -> Vec<Slot> {
+        self.ends.iter().map(|(_, slot)| *slot).collect()
     }
 
     fn singular(&self, singular: &Singular) -> Diagnostic {
@@ -174,22 +224,14 @@ impl Fixed<'_> {
         let (at, step) = (amount(value, unit), duration(self.step, 3));
         let rate = two(singular.rate);
         // With γhλ ≤ ½ the equations of a step are far from singular.
-        let shorter = below(0.5 / (fixed_step::GAMMA * singular.rate));
-        let shorter = if self.rig {
-            format!("divide the period: `solver implicit step {shorter}`")
-        } else {
-            format!("write `step {shorter}`")
-        };
+        let shorter = self.shorter(0.5 / (fixed_step::GAMMA * singular.rate));
         Diagnostic::warning("W0704", format!("implicit at {step} is a large step for this model"))
             .label(self.run, format!("near {} = {at} the model itself grows at {rate} 1/s", moved.path))
             .label(
                 self.place,
                 format!("from {} 1/s on a step overshoots without limit", two(1.0 / (fixed_step::GAMMA * self.step))),
             )
-            .help(format!(
-                "{shorter}{}\nTo keep it: `allow large-step \"...\"`",
-                if self.rig { "" } else { ", or leave `solver` out: adaptive" }
-            ))
+            .help(format!("{shorter}{}\nTo keep it: `allow large-step \"...\"`", self.adaptive()))
     }
 
     fn chatters(&self, chatter: &Chatter) -> Diagnostic {
@@ -338,6 +380,15 @@ fn amount(value: f64, unit: &Unit) -> String {
 /// A number with two digits.
 fn two(x: f64) -> String {
     significant(x, 2)
+}
+
+/// The largest stable step as diagnostics, explanations and predictions name it: `any` for all that are examined.
+pub fn stable_up_to(largest: f64) -> String {
+    match largest {
+        0.0 => "less than 10 ns".into(),
+        largest if largest >= LONGEST => "any".into(),
+        largest => duration(largest, 2),
+    }
 }
 
 /// The greatest round time (1, 2 or 5 times a power of ten) that is not above t.

@@ -23,7 +23,7 @@ use crate::pipeline::{Depth, analyse};
 use crate::rig::{self, LoadedRig};
 use abi::plan::{self, Formula, MeasureKind, Method, PARTS, Solver};
 use abi::unit::{Dimension, Unit};
-use grammar::ast::{self, BinaryOp, ExperimentStatement, Expr, SweepOver};
+use grammar::ast::{self, BinaryOp, ExperimentStatement, Expr, Spacing, SweepOver};
 use grammar::diagnostic::Diagnostic;
 use grammar::span::{FileId, Span};
 use std::sync::Arc;
@@ -47,6 +47,9 @@ pub struct Changes {
     pub ports: Option<Ports>,
     /// Additional statements of the experiment, as text: `expect max(x) < 1 mm`.
     pub also: Vec<String>,
+    /// Does not check whether the step is stable, for questions that do not run the experiment, and for a run that is
+    /// only compared with it.
+    pub any_step: bool,
     /// Omits the experiment's own expectations. A question at the prompt does not judge the run, and a window of an
     /// expectation may lie beyond the compiled duration.
     pub unjudged: bool,
@@ -91,8 +94,18 @@ pub struct Variant {
     pub places: Vec<(PlanNumber, ExprId)>,
     /// Inputs of a linearisation, each with the slot that perturbs it, and its outputs.
     pub ports: PortSlots,
-    /// For software in the loop: the plan of the rig, and the program of the part that hardware would replace.
-    pub rig: Option<(abi::rig::Rig, crate::ir::program::Program)>,
+    /// For software in the loop: the rig.
+    pub rig: Option<SimulatedRig>,
+}
+
+/// A rig that an experiment runs against its own plant.
+pub struct SimulatedRig {
+    /// The plan of the rig.
+    pub rig: abi::rig::Rig,
+    /// The program of the part that hardware would replace.
+    pub plant: crate::ir::program::Program,
+    /// The rig before its programs, for checks of its steps.
+    pub cut: rig::PartitionedRig,
 }
 
 /// Default tolerance of an adaptive run.
@@ -105,6 +118,7 @@ const MOST_STEPS: f64 = 1e12;
 pub const MOST_VARIANTS: usize = 100_000;
 
 /// The statements of an experiment, by kind.
+#[derive(Clone)]
 struct Statements<'a> {
     span: Span,
     run: &'a ast::Run,
@@ -178,6 +192,10 @@ pub fn read(
         return Err(diagnostics);
     }
     let combinations = combinations(&parts, &grids);
+    let unmatched = unmatched_cases(loaded, &parts, &combinations, &given);
+    if !unmatched.is_empty() {
+        return Err(unmatched);
+    }
     if combinations.is_empty() || combinations.len() > MOST_VARIANTS {
         let span = parts.sweeps.first().map_or(experiment.span, |sweep| sweep.span);
         let message = match combinations.len() {
@@ -197,6 +215,18 @@ pub fn read(
     let mut variants = Vec::new();
     for combination in combinations {
         let label = label(loaded, &combination);
+        let applies = |expect: &&ast::Expect| {
+            expect.cases.iter().all(|case| {
+                let found = combination.iter().find(|(change, _)| same_path(change.path, &case.path));
+                found.is_some_and(|(change, _)| meets(loaded, case, change.value))
+                    || given.set.iter().any(|set| {
+                        same_path(&set.path, &case.path) && meets(loaded, case, CommandLine::change(set).value)
+                    })
+            })
+        };
+        let mut parts = parts.clone();
+        parts.expects.retain(applies);
+        let parts = &parts;
         let changes = combination.iter().map(|(change, _)| *change).chain(given.set.iter().map(CommandLine::change));
         let written = arg_paths.iter().zip(args).map(|(path, bind)| {
             let value = match &bind.value {
@@ -211,7 +241,7 @@ pub fn read(
             loaded,
             sources,
             name,
-            &parts,
+            parts,
             prepared.as_ref(),
             &data,
             overrides,
@@ -336,6 +366,7 @@ fn parts<'a>(
     let mut run: Option<&ast::Run> = None;
     let mut parts = (None, Vec::new(), None, Vec::new(), Vec::new());
     let (mut stepped, mut allowed) = (false, Vec::new());
+    let mut unknown = Vec::new();
     let mut twice = |what: &str, span: Span, first: Span| {
         let error = Diagnostic::error("E0301", format!("an experiment has one `{what}`"))
             .label(span, "again here")
@@ -360,11 +391,14 @@ fn parts<'a>(
             ExperimentStatement::Plot(one) => parts.3.push(one),
             ExperimentStatement::Expect(one) => parts.4.push(one),
             ExperimentStatement::Allow(allow) => {
+                let own = matches!(allow.lint.text.as_str(), "discretisation" | "recording-ends");
                 stepped |= allow.lint.text == "discretisation";
                 allowed.push(allow.lint.text.as_str());
+                unknown.extend(unknown_lint(&allow.lint).filter(|_| !own));
             }
         }
     }
+    diagnostics.extend(unknown);
     let Some(run) = run else {
         if misread {
             return None;
@@ -454,34 +488,86 @@ fn recording(
     Some(named.map(table).collect())
 }
 
-/// The values of each sweep `first .. last by step` as literals.
+/// The values of each sweep over a grid, `first .. last by step`, as literals.
 fn grids(loaded: &Loaded, parts: &Statements, diagnostics: &mut Vec<Diagnostic>) -> Vec<Vec<Expr>> {
     let mut out = Vec::new();
     for sweep in &parts.sweeps {
         let mut values = Vec::new();
-        if let SweepOver::Grid { first, last, step } = &sweep.over {
-            match (quantity(first), quantity(last), quantity(step)) {
-                (Some((a, unit, text)), Some((b, other, _)), Some((h, third, _)))
-                    if unit.dimension == other.dimension && unit.dimension == third.dimension && h > 0.0 =>
-                {
-                    let count = ((b - a) / h + 1e-9).floor();
-                    for k in 0..=(count.clamp(-1.0, MOST_VARIANTS as f64) as i64) {
-                        let value = unit.from_si(a + k as f64 * h);
-                        let kind = ast::ExprKind::Number { value: rounded(value), unit: text.clone() };
-                        values.push(Expr { kind, span: first.span });
-                    }
+        if let SweepOver::Grid { first, last, spacing } = &sweep.over {
+            match grid(first, last, spacing) {
+                Ok((numbers, unit)) => {
+                    let literal = |value: f64| Expr {
+                        kind: ast::ExprKind::Number { value, unit: unit.clone() },
+                        span: first.span,
+                    };
+                    values.extend(numbers.into_iter().map(literal));
                 }
-                _ => {
-                    let error = Diagnostic::error("E0902", "a sweep goes from a number to a number by a positive step")
-                        .label(sweep.span, loaded.files.slice(sweep.span).lines().next().unwrap_or_default())
-                        .help("all three in units of one kind: `sweep fr.Fs = 1 N .. 2 N by 0.25 N`");
-                    diagnostics.push(error);
+                Err((message, help)) => {
+                    let text = loaded.files.slice(sweep.span).lines().next().unwrap_or_default();
+                    diagnostics.push(Diagnostic::error("E0902", message).label(sweep.span, text).help(help));
                 }
             }
         }
         out.push(values);
     }
     out
+}
+
+/// The numbers of a grid in the unit of its first value, and that unit.
+///
+/// # Errors What is wrong with it, and how to write it.
+type Grid = Result<(Vec<f64>, Option<ast::UnitText>), (&'static str, &'static str)>;
+
+fn grid(first: &Expr, last: &Expr, spacing: &Spacing) -> Grid {
+    const ENDS: (&str, &str) = (
+        "a sweep goes from a number to a number by a positive step",
+        "all three in units of one kind: `sweep fr.Fs = 1 N .. 2 N by 0.25 N`",
+    );
+    let (Some((a, unit, text)), Some((b, other, _))) = (quantity(first), quantity(last)) else { return Err(ENDS) };
+    if unit.dimension != other.dimension {
+        return Err(ENDS);
+    }
+    let (number, log) = match spacing {
+        Spacing::By(step) => {
+            let Some((h, third, _)) = quantity(step) else { return Err(ENDS) };
+            if unit.dimension != third.dimension || h <= 0.0 {
+                return Err(ENDS);
+            }
+            let count = ((b - a) / h + 1e-9).floor().clamp(-1.0, MOST_VARIANTS as f64) as i64;
+            let value = |k: i64| rounded(unit.from_si(a + k as f64 * h));
+            return Ok(((0..=count).map(value).collect(), text));
+        }
+        Spacing::Lin(number) => (number, false),
+        Spacing::Log(number) => (number, true),
+    };
+    let count = quantity(number)
+        .filter(|(n, unit, _)| unit.text.is_empty() && n.fract() == 0.0 && *n >= 2.0 && *n <= MOST_VARIANTS as f64);
+    let Some((count, ..)) = count else {
+        return Err(("the number of values is a whole number from 2 on", "write for example `1 N/s .. 50 N/s log 10`"));
+    };
+    if log && !(a * b > 0.0 && (b / a).is_finite()) {
+        return Err((
+            "a logarithmic grid has ends of one sign, and neither is 0",
+            "write `lin` in place of `log`, or begin above 0",
+        ));
+    }
+    let count = count as usize;
+    Ok((spaced(count, a, b, log).into_iter().map(|value| rounded(unit.from_si(value))).collect(), text))
+}
+
+/// `count` numbers from `a` to `b`, both included: in equal ratios if `log`, else at equal distances.
+pub fn spaced(count: usize, a: f64, b: f64, log: bool) -> Vec<f64> {
+    let power = log.then(|| Alone::binary(Binary::Pow));
+    let value = |k: usize| {
+        let part = k as f64 / (count.max(2) - 1) as f64;
+        match (k, &power) {
+            (0, _) => a,
+            (k, _) if k + 1 == count => b,
+            (_, Some(power)) => a * power.of_both(b / a, part),
+            (_, None) => a + (b - a) * part,
+        }
+    };
+    (0..count).map(value).collect()
 }
 
 /// A number rounded to twelve digits, which removes the rounding errors of `a + k·h`.
@@ -542,6 +628,72 @@ fn combinations<'a>(parts: &Statements<'a>, grids: &'a [Vec<Expr>]) -> Vec<Vec<(
     out
 }
 
+fn same_path(a: &ast::Path, b: &ast::Path) -> bool {
+    let part = |segment: &ast::Segment| (segment.name.text.clone(), segment.index);
+    a.segments.iter().map(part).eq(b.segments.iter().map(part))
+}
+
+/// Whether a value of a sweep is the one that a case names: the same number, or else the same text.
+fn meets(loaded: &Loaded, case: &ast::Case, value: OverrideValue) -> bool {
+    let plain = |span: Span| loaded.files.slice(span).split_whitespace().collect::<String>();
+    match (&case.value, value) {
+        (ast::BindValue::Expr(wanted), OverrideValue::Expr(value)) => match (quantity(wanted), quantity(value)) {
+            (Some((a, unit, _)), Some((b, other, _))) => {
+                unit.dimension == other.dimension && (a - b).abs() <= 1e-9 * a.abs().max(b.abs())
+            }
+            _ => plain(wanted.span) == plain(value.span),
+        },
+        (ast::BindValue::Instance(wanted), OverrideValue::Instance(value)) => plain(wanted.span) == plain(value.span),
+        (ast::BindValue::Expr(_), OverrideValue::Instance(_))
+        | (ast::BindValue::Instance(_), OverrideValue::Expr(_)) => false,
+    }
+}
+
+/// Errors about expectations for a case that no sweep has. A value that is set or varied from outside replaces the sweep,
+/// and the expectation then applies to that value or to none.
+fn unmatched_cases(
+    loaded: &Loaded,
+    parts: &Statements,
+    combinations: &[Vec<(Change, Option<String>)>],
+    given: &CommandLine,
+) -> Vec<Diagnostic> {
+    let mut errors = Vec::new();
+    for case in parts.expects.iter().flat_map(|expect| &expect.cases) {
+        let text = loaded.files.slice(case.path.span);
+        let outside = given.set.iter().any(|set| same_path(&set.path, &case.path))
+            || given.vary.iter().any(|path| *path == text.split_whitespace().collect::<String>());
+        if outside {
+            continue;
+        }
+        let swept = || combinations.iter().flatten().filter(|(change, _)| same_path(change.path, &case.path));
+        if swept().any(|(change, _)| meets(loaded, case, change.value)) {
+            continue;
+        }
+        let mut values: Vec<String> = Vec::new();
+        for (change, shown) in swept() {
+            let value = shown.clone().unwrap_or_else(|| match change.value {
+                OverrideValue::Expr(expr) => one_line(loaded.files.slice(expr.span)),
+                OverrideValue::Instance(instance) => one_line(loaded.files.slice(instance.span)),
+            });
+            if !values.contains(&value) && values.len() < 12 {
+                values.push(value);
+            }
+        }
+        let (message, help) = match values.is_empty() {
+            true => (
+                format!("this experiment does not sweep `{text}`"),
+                format!("`for` names a case of a sweep: add `sweep {text} = …`, or leave it out"),
+            ),
+            false => (
+                format!("no case of the sweep is `{}`", one_line(loaded.files.slice(case.span))),
+                format!("the sweep has {text} = {}", values.join(", ")),
+            ),
+        };
+        errors.push(Diagnostic::error("E0902", message).label(case.span, "no such case").help(help));
+    }
+    errors
+}
+
 /// `fr = LuGre(), k = 2 N/m`
 fn label(loaded: &Loaded, combination: &[(Change, Option<String>)]) -> String {
     let one = |(change, text): &(Change, Option<String>)| {
@@ -560,6 +712,7 @@ fn one_line(text: &str) -> String {
 }
 
 /// Indices of an expectation's expressions among the observed ones.
+#[derive(Clone, Copy)]
 struct ExpectAt {
     value: usize,
     near: Option<(usize, usize)>,
@@ -750,7 +903,10 @@ fn variant<'a>(
             "fixed steps take any number, for example `solver expo step 0.1 ms`; up to {MOST_DENSE} go adaptively"
         ))]);
     }
-    let mut rig = cut.map(|cut| cut.with_plant(&lowered, own));
+    let mut rig = cut.map(|cut| {
+        let (rig, plant) = cut.with_plant(&lowered, own);
+        SimulatedRig { rig, plant, cut }
+    });
     let Lowered { mut program, observed: slots } = lowered;
     program.description.name = one_line(loaded.files.slice(parts.run.instance.span));
     for root in &mut program.description.roots {
@@ -758,7 +914,7 @@ fn variant<'a>(
     }
     let mut adaptive = None;
     match &mut rig {
-        Some((rig, plant)) => {
+        Some(SimulatedRig { rig, plant, .. }) => {
             program.size_rings(rig.period_ns as f64 * 1e-9 / f64::from(rig.steps));
             plant.size_rings(solver.step);
         }
@@ -1188,6 +1344,7 @@ impl Reader<'_> {
                 shows: Some(curve.show.unit.clone()),
                 after: plot.after.clone(),
                 before: plot.before.clone(),
+                cases: Vec::new(),
                 span: curve.show.span,
             };
             let at = ExpectAt { value: at.value, near: None, after: window.0, before: window.1 };
@@ -1318,6 +1475,24 @@ impl Reader<'_> {
                 self.shown_in(value_node, target_node, Formula::Near { value, target, tolerance, relative })
             }
         };
+        let mut at = *at;
+        // A window that begins or ends with an event belongs to each measure.
+        for before in [false, true] {
+            let end = if before { &mut at.before } else { &mut at.after };
+            let Some(node) = end.map(|end| nodes[end]).filter(|node| self.measured(*node)) else { continue };
+            *end = None;
+            let place = if before { PlanNumber::Before(self.expect) } else { PlanNumber::After(self.expect) };
+            let edge = self.edge(node, place)?;
+            let event = one_line(self.loaded.files.slice(self.system.span(node)));
+            for measure in &mut measures {
+                let own = if before { &mut measure.window.before } else { &mut measure.window.after };
+                if matches!(own, plan::Edge::Open) {
+                    *own = edge;
+                    // The same measure over the whole run is another number.
+                    measure.text += &format!(" {} {event}", if before { "before" } else { "after" });
+                }
+            }
+        }
         for (at, place) in [(at.after, PlanNumber::After(self.expect)), (at.before, PlanNumber::Before(self.expect))] {
             self.places.extend(at.map(|at| (place, nodes[at])));
         }

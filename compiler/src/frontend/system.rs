@@ -4,9 +4,11 @@
 //! operands precede their users, so most passes are a single walk over it. Function calls are expanded in place with
 //! shared nodes for their arguments, so nothing is computed twice. Knows nothing of text or of programs.
 
+use crate::frontend::names::nearest;
 pub use crate::functions::Builtin;
 use abi::unit::{Angle, Dimension, Unit};
-use grammar::ast::BinaryOp;
+use grammar::ast::{BinaryOp, Name};
+use grammar::diagnostic::Diagnostic;
 use grammar::span::Span;
 
 /// Index of a node in the arena.
@@ -446,6 +448,19 @@ pub struct Table {
     pub x: Vec<f64>,
     /// Values, in SI units.
     pub y: Vec<f64>,
+}
+
+/// E0204 for `allow` with a name that is no lint.
+pub fn unknown_lint(lint: &Name) -> Option<Diagnostic> {
+    let names = || LINTS.iter().map(|(name, _)| *name);
+    if names().any(|name| name == lint.text) {
+        return None;
+    }
+    let error = Diagnostic::error("E0204", format!("there is no lint `{}`", lint.text)).label(lint.span, "not known");
+    Some(match nearest(&lint.text, names()) {
+        Some(near) => error.help(format!("did you mean `{near}`?")),
+        None => error.help(format!("lints are {}", names().collect::<Vec<_>>().join(", "))),
+    })
 }
 
 /// Name and code of every lint.

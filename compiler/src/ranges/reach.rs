@@ -50,6 +50,8 @@ pub struct Reach<'a> {
     bounding: Vec<VarId>,
     /// Parameters whose ranges are taken without their ends, to try whether a strict range would suffice.
     strict: Vec<VarId>,
+    /// Parameters and inputs that are taken as positive, to try whether such a range would suffice.
+    positive: Vec<VarId>,
 }
 
 impl<'a> Reach<'a> {
@@ -67,6 +69,7 @@ impl<'a> Reach<'a> {
             open: Vec::new(),
             bounding: Vec::new(),
             strict: Vec::new(),
+            positive: Vec::new(),
         };
         let facts = reach.requires.clone();
         reach.required = facts.into_iter().flat_map(|fact| reach.order(fact)).collect();
@@ -171,6 +174,13 @@ impl<'a> Reach<'a> {
         other.interval(id)
     }
 
+    /// The interval of an expression if a parameter or input were declared `in > 0`, and without branch facts.
+    pub fn if_positive(&mut self, param: VarId, id: ExprId) -> Interval {
+        let mut other = Reach::new(self.system);
+        other.positive.push(param);
+        other.interval(id)
+    }
+
     /// The interval of a quantity's value without regard to its own declared range.
     pub fn unbound(&mut self, id: VarId) -> Interval {
         match self.system.var(id).definition {
@@ -188,6 +198,7 @@ impl<'a> Reach<'a> {
         }
         self.bounding.push(id);
         let low = range.low.map(|(bound, open)| least(self.plain(bound).low, open || strict));
+        let low = if self.positive.contains(&id) { Some(low.unwrap_or(0.0).max(least(0.0, true))) } else { low };
         let high = range.high.map(|(bound, open)| greatest(self.plain(bound).high, open || strict));
         self.bounding.pop();
         Interval::closed(low.unwrap_or(f64::NEG_INFINITY), high.unwrap_or(f64::INFINITY))

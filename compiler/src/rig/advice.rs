@@ -164,10 +164,11 @@ fn emulation(rig: &Rig, control: &Program, plant: &Program, places: &RigSpans, f
         let (fastest, ratio) = Emulated::stiffest(period, node.lag, tau);
         let most = inertia * fastest * fastest;
         let help = format!(
-            "the contact has {} N·m/rad on {} kg·m^2: stable up to {} ms, within 4 % (`fric predict` computes it from the \
-             compiled step). At {} ms a stiffness up to {} N·m/rad can be rendered, with a damping ratio of {}; or write \
-             `predict {}`",
+            "the contact has {} N·m/rad with a damping ratio of {} on {} kg·m^2: stable up to {} ms, within 4 % (`fric \
+             predict` computes it from the compiled step). At {} ms up to {} N·m/rad can be rendered, but with a damping \
+             ratio of {}; or write `predict {}`",
             three_digits(contact.stiffness),
+            three_digits(zeta),
             three_digits(inertia),
             ms(limit),
             ms(tau),

@@ -241,6 +241,7 @@ pub fn read<'a>(
     reader.diagnostics.extend(flat.diagnostics);
     let framed = flat.framed?;
     let cut = reader.cut(flat.system, flat.observed, framed, expressions, lists);
+    diagnostics.extend(statements.allows.iter().filter_map(|allow| unknown_lint(&allow.lint)));
     let allowed = |lint: &str| statements.allows.iter().any(|allow| allow.lint.text == lint);
     diagnostics.retain(|said| {
         let lint = LINTS.iter().find(|(_, code)| *code == said.code);

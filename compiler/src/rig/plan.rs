@@ -5,6 +5,7 @@
 
 use super::margins::{self, Margin};
 use super::*;
+use crate::analysis::step_stability_report::{self, StepBy};
 use crate::ir::program::Program;
 use crate::lower::{self, lower};
 use frames::{MessageLayout, OnBus};
@@ -563,7 +564,7 @@ impl PartitionedRig {
     }
 
     /// The plan and the plant program, for a control program whose first `own` outputs are those of the rig.
-    pub fn with_plant(self, control: &lower::Lowered, own: usize) -> (Rig, Program) {
+    pub fn with_plant(&self, control: &lower::Lowered, own: usize) -> (Rig, Program) {
         let plant = lower(&self.plant, &self.plant_types, &self.wanted_of_plant());
         let rig = self.finish(&control.program, &control.observed[..own], &plant);
         (rig, plant.program)
@@ -593,24 +594,30 @@ impl PartitionedRig {
         found
     }
 
-    /// Warnings about the steps of the control program, except those that the rig allows.
-    pub fn steps(&self, lowered: &super::Lowered, files: &Files) -> Vec<Diagnostic> {
-        let super::Lowered { rig, control, .. } = lowered;
+    /// Errors and warnings about the steps of the control program, except those that the rig allows. `system` and
+    /// `types`: of the control program.
+    pub fn steps(
+        &self,
+        (system, types): (&System, &Types),
+        rig: &Rig,
+        control: &Program,
+        files: &Files,
+    ) -> Vec<Diagnostic> {
         let ends: Vec<(ExprId, Slot)> =
             self.stops.iter().zip(&rig.stops).map(|(condition, stop)| (*condition, stop.slot)).collect();
-        let fixed = crate::analysis::step_stability_report::Fixed {
-            system: &self.control,
-            types: &self.control_types,
+        let fixed = step_stability_report::Fixed {
+            system,
+            types,
             program: control,
             method: rig.method,
             step: rig.period_ns as f64 * 1e-9 / f64::from(rig.steps),
             place: self.places.solver,
             run: self.places.run,
             ends: &ends,
-            rig: true,
+            by: StepBy::Rate,
+            name: &rig.name,
         };
-        let mut found = crate::analysis::step_stability_report::check(&fixed, files);
-        let (system, types) = (fixed.system, fixed.types);
+        let mut found = step_stability_report::check(&fixed, files);
         found.extend(crate::analysis::acting_mass::check(system, types, control, rig.plant.inertia, fixed.run));
         found.retain(|said| said.is_error() || !self.allowed(said));
         found

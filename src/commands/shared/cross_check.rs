@@ -137,7 +137,8 @@ pub fn cross(
 ) -> Option<Vec<Crossed>> {
     let own = cases.first()?.experiment.solver;
     let changed = |method, step| Options {
-        changes: Changes { method: Some(method), step, tol: None, ..options.changes.clone() },
+        // The comparison shows what an unstable step does.
+        changes: Changes { method: Some(method), step, tol: None, any_step: true, ..options.changes.clone() },
         ..options.clone()
     };
     let partner = match own.method.is_fixed() {

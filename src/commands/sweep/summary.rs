@@ -211,8 +211,8 @@ impl Summary {
                 self.best.truncate(best.count);
             }
         }
-        if self.draws > 0 {
-            self.points.entry(row[0] as u64 / self.draws).or_default().push(row.clone());
+        if let Some(point) = (row[0] as u64).checked_div(self.draws) {
+            self.points.entry(point).or_default().push(row.clone());
         }
         if self.rows.is_multiple_of(self.every) {
             self.kept.push(row);

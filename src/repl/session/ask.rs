@@ -121,11 +121,11 @@ impl Session {
     }
 
     /// The quantities of an instance or a part with their present values; none if there is no part of this name.
-    pub fn part_values(&self, name: &str) -> Option<Result<Vec<(Listed, Value)>, Fault>> {
+    pub fn part_values(&self, name: &str) -> Option<Result<Vec<(QuantityInfo, Value)>, Fault>> {
         let what = self.meant(name).unwrap_or_else(|| self.current());
         let prefix = format!("{name}.");
         let known = self.setup(&what).known.clone();
-        let listed: Vec<Listed> = known.iter().filter(|q| q.path.starts_with(&prefix)).cloned().collect();
+        let listed: Vec<QuantityInfo> = known.iter().filter(|q| q.path.starts_with(&prefix)).cloned().collect();
         if listed.is_empty() || known.iter().any(|q| q.path == name) {
             return None;
         }

@@ -72,7 +72,7 @@ fn imports(used: &super::Used, folder: &Path) -> String {
     let beside = path.parent().unwrap_or(Path::new(""));
     let mut lines = vec![format!("import \"{}\"\n", from(path))];
     let file = used.loaded.files.get(used.loaded.root());
-    for item in &file.ast.items {
+    for item in file.ast.items() {
         let Item::Import(import) = item else { continue };
         let text = used.loaded.files.slice(import.span).trim();
         let line = match text.split_once('"') {

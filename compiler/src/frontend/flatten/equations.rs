@@ -49,19 +49,10 @@ impl<'a> Flattener<'a> {
         self.undefined(id, &defined);
     }
 
-    /// E0204: an unknown lint.
     pub(super) fn lint(&mut self, lint: &Name) {
-        if LINTS.iter().any(|(name, _)| *name == lint.text) {
-            return;
+        if let Some(error) = unknown_lint(lint) {
+            self.report(error);
         }
-        let error =
-            Diagnostic::error("E0204", format!("there is no lint `{}`", lint.text)).label(lint.span, "not known");
-        self.report(match nearest(&lint.text, LINTS.iter().map(|(name, _)| *name)) {
-            Some(near) => error.help(format!("did you mean `{near}`?")),
-            None => {
-                error.help(format!("lints are {}", LINTS.iter().map(|(name, _)| *name).collect::<Vec<_>>().join(", ")))
-            }
-        });
     }
 
     pub(super) fn var_named(&self, id: InstanceId, name: &str) -> Option<VarId> {

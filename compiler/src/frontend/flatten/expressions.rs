@@ -224,7 +224,12 @@ impl<'a> Flattener<'a> {
             None => Node::Number { value, dimension: Some(Dimension::NONE), angle: Angle::Silent },
             Some(text) => match Unit::parse(&text.text) {
                 Err(part) => {
-                    self.report(unknown_unit(text, &part));
+                    let is_name = env.instance.is_some_and(|id| self.tree(id).names.contains_key(part.as_str()));
+                    let error = match read_on(text, &part).filter(|_| is_name) {
+                        Some(error) => error,
+                        None => unknown_unit(text, &part),
+                    };
+                    self.report(error);
                     Node::Error
                 }
                 Ok(unit) => {
@@ -617,9 +622,28 @@ impl<'a> Flattener<'a> {
             "der" | "diff" | "ddt" => Some("a derivative is written `dz/dt`".to_string()),
             "sgn" | "signum" => Some("write `sign(…)`".into()),
             "ln" => Some("write `log(…)`: the natural logarithm".into()),
-            "pow" => Some("write `a ^ b`".into()),
-            "sat" | "limit" | "saturate" => Some("write `clamp(x, low, high)`".into()),
-            "fabs" => Some("write `abs(…)`".into()),
+            "log10" => Some("write `log(…) / log(10)`".into()),
+            "pow" | "power" => Some("write `a ^ b`".into()),
+            "sat" | "limit" | "saturate" | "saturation" => Some("write `clamp(x, low, high)`".into()),
+            "fabs" | "norm" => Some("write `abs(…)`".into()),
+            "mod" | "rem" | "fmod" => Some("write `x - y * floor(x / y)`".into()),
+            "round" => Some("write `floor(x + 0.5)`".into()),
+            "ceil" => Some("write `-floor(-x)`".into()),
+            "heaviside" | "stepfun" => Some("write `if x > 0 then 1 else 0`; over time `step(1 s, 2 N)`".into()),
+            "sum" | "total" => Some("`sum` adds a quantity of several parts: `part el[i in 1 .. 4] = Model(k = i * 1 N/m)`, then `sum(el.f)`; a fixed sum is written out".into()),
+            "prev" | "pre" | "last" | "memory" | "unitdelay" | "UnitDelay" => Some(
+                "a state keeps a value until the next tick: `state y1 [m] = 0`, and in `every Ts { next(y1) = y }`".into(),
+            ),
+            "integ" | "int" | "integrate" | "cumtrapz" => Some("an integral is a state: `state i [m] = 0` and `di/dt = …`".into()),
+            "interp1" | "interp" | "lookup" | "lut" => {
+                Some("a curve of points is a `table F(v [m/s]) [N] = linear { 0 m/s: 1 N, 1 m/s: 2 N }`".into())
+            }
+            "overshoot" => Some("write `max(x) / final(x) - 1`, a measure of an experiment".into()),
+            "risetime" | "rise_time" => Some("write `first(x > 0.9 m) - first(x > 0.1 m)`, a measure of an experiment".into()),
+            "settlingtime" | "settling_time" | "stepinfo" => {
+                Some("write `settling(x, 1 mm)`, a measure of an experiment".into())
+            }
+            "rand" | "randn" | "random" => Some("write `noise(1 N, 1 ms, 1)`: amplitude, hold time, seed".into()),
             name => nearest(name, known).map(|near| format!("did you mean `{near}`?")),
         };
         if let Some(help) = help.or_else(|| self.module_with(&function.text).map(|m| format!("add `import {m}`"))) {

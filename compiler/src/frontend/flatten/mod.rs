@@ -466,6 +466,9 @@ fn unknown_unit(unit: &ast::UnitText, part: &str) -> Diagnostic {
     if let Some((_, what)) = OTHERS.iter().find(|(names, _)| names.contains(&part)) {
         return error.help(*what);
     }
+    if let Some(apart) = apart(part) {
+        return error.help(format!("between units write `·`: `{}`", unit.text.replacen(part, &apart, 1)));
+    }
     // For short words only a difference of case counts as near.
     let near = |known: &&str| known.eq_ignore_ascii_case(part) || part.len() > 2 && known.len() > 1;
     match nearest(part, known.into_iter().filter(near)).filter(|near| near.len() + 1 >= part.len()) {
@@ -473,6 +476,32 @@ fn unknown_unit(unit: &ast::UnitText, part: &str) -> Diagnostic {
         None => error
             .help("units are m g s min h A K N J W Pa V Ohm Hz rad deg rev rpm bit %, with G M k m u n before them"),
     }
+}
+
+/// `N·s` for `Ns`: known units without a sign between them; the fewest, of those the ones without a prefix.
+fn apart(part: &str) -> Option<String> {
+    let known = |text: &str| Unit::parse(text).is_ok_and(|unit| !unit.text.is_empty() && !text.contains('%'));
+    let cuts: Vec<usize> = part.char_indices().map(|(at, _)| at).skip(1).collect();
+    let pairs = cuts.iter().map(|&at| vec![&part[..at], &part[at..]]);
+    let triples = cuts
+        .iter()
+        .enumerate()
+        .flat_map(|(k, &at)| cuts[k + 1..].iter().map(move |&next| vec![&part[..at], &part[at..next], &part[next..]]));
+    let found = pairs.chain(triples).find(|words| words.iter().all(|word| known(word)))?;
+    Some(found.join("·"))
+}
+
+/// E0111 for `300 N*s/m*v`, where `v` is a name of the model: without a blank a factor is read as part of the unit.
+fn read_on(unit: &ast::UnitText, part: &str) -> Option<Diagnostic> {
+    let before = unit.text.strip_suffix(part)?;
+    let (own, sign) = (before.strip_suffix(['*', '·', '/'])?, before.chars().last()?);
+    Unit::parse(own).ok()?;
+    let sign = if sign == '/' { '/' } else { '*' };
+    Some(
+        Diagnostic::error("E0111", format!("`{part}` is read as a unit here"))
+            .label(unit.span, "one unit: a unit has no blanks")
+            .help(format!("put a blank before the `{sign}`: `{own} {sign} {part}`")),
+    )
 }
 
 fn args_of<'a>(args: &'a [ast::Bind], env: &Env) -> Vec<Arg<'a>> {
