@@ -767,7 +767,7 @@ fn rows_of_a_csv_lie_on_a_grid() {
 /// A spring pulled at a speed: its force is k vp t, so each measure of a case has a closed form.
 const SPRING: &str = r#"
 model Spring {
-  input  vp [m/s] = 0.1 m/s
+  param  vp = 0.1 m/s
   param  k = 2 N/m  in > 0
   state  x [m] = 0
   dx/dt  = vp
