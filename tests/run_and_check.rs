@@ -123,9 +123,25 @@ fn originals() -> Vec<(String, String)> {
     all.map(|(path, text)| (path.file_name().unwrap().to_string_lossy().into_owned(), text)).collect()
 }
 
+/// The measured points that the examples import.
+fn points() -> Texts {
+    let mut points = Vec::new();
+    for folder in std::fs::read_dir(root().join("examples")).unwrap() {
+        for file in std::fs::read_dir(folder.unwrap().path()).into_iter().flatten() {
+            let path = file.unwrap().path();
+            if path.extension().is_some_and(|extension| extension == "csv") {
+                let name = path.file_name().unwrap().to_string_lossy().into_owned();
+                points.push((name, std::fs::read_to_string(path).unwrap()));
+            }
+        }
+    }
+    assert!(!points.is_empty());
+    Texts(points)
+}
+
 #[test]
 fn run_refuses_what_check_refuses() {
-    let (texts, sources, seeds) = (originals(), Texts::default(), seeds(CASES));
+    let (texts, sources, seeds) = (originals(), points(), seeds(CASES));
     println!("seeds {seeds:?}, {} texts", texts.len());
     let (mut refused, mut steps) = (0, 0);
     for seed in seeds.clone() {
@@ -169,7 +185,7 @@ fn words(found: &[Diagnostic]) -> String {
 /// The step that `explain` names is the one that a refusal names; below it a step passes, above it none does.
 #[test]
 fn all_commands_name_one_largest_stable_step() {
-    let (texts, sources) = (originals(), Texts::default());
+    let (texts, sources) = (originals(), points());
     let (mut named, mut random) = (0, Random(7));
     for (name, text) in &texts {
         let mut loaded = compiler::load(name, text, &sources);

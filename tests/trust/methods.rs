@@ -249,7 +249,7 @@ experiment it {{ run {} for 1 s  solver {method} step {} us }}",
     .replace(" import", "\nimport");
     let sources = Texts::default();
     let (mut loaded, _) = checked("methods.fric", &text, &sources);
-    let options = Options { changes: Changes::default(), interpret: false };
+    let options = Options { changes: Changes { any_step: true, ..Changes::default() }, interpret: false };
     let cases = compiler::compile(&mut loaded, &sources, "it", &options, &mut Vec::new(), &mut |_| ());
     let mut run: Instance = cases.map_err(|found| format!("{}: {found:?}", case.run))?.remove(0).instance;
     let quantity = case.bench.quantity;
