@@ -125,12 +125,12 @@ impl Terminal {
         self.wait("fric> ")
     }
 
-    /// Ends the input and waits for the end; returns the exit code. The key is sent again from time to time: the change
-    /// from one mode of the terminal to the other discards it while an answer is being printed.
-    fn end(mut self) -> Option<i32> {
+    /// Sends keys that end the program; returns the exit code. They are sent repeatedly: while an answer is being printed,
+    /// the terminal's change of mode can discard them.
+    fn end(mut self, keys: &str) -> Option<i32> {
         let begun = Instant::now();
         while begun.elapsed() < PATIENCE {
-            let _ = self.keys.write_all(b"\x04"); // Fails once the program has ended.
+            let _ = self.keys.write_all(keys.as_bytes()); // Fails once the program has ended.
             let sent = Instant::now();
             while sent.elapsed() < Duration::from_secs(1) {
                 if let Some(status) = self.child.try_wait().unwrap() {
@@ -205,7 +205,7 @@ fn a_session_is_typed_completed_plotted_and_goes_on_after_errors() {
     assert!(at.line("f.Fs").contains("1.5 N"), "a refused setting changes nothing");
     assert!(at.line("1 N + 1 N").contains("2 N"));
 
-    assert_eq!(at.end(), Some(0));
+    assert_eq!(at.end("\x04"), Some(0));
 }
 
 /// All lines of an input are redrawn at each key, so the test waits for answers, not prompts.
@@ -242,7 +242,7 @@ fn an_item_is_typed_over_several_lines_or_pasted() {
     at.wait("}");
     at.send("\x03");
     at.send_until("e.F\r", "4 N\n");
-    assert_eq!(at.end(), Some(0));
+    assert_eq!(at.end("\x04"), Some(0));
 }
 
 #[test]
@@ -280,8 +280,7 @@ fn history_is_there_in_the_next_session() {
     let mut first = Terminal::new(&folder, &[]);
     first.wait("fric> ");
     assert!(first.line("21 mm * 2").contains("42 mm"));
-    first.send("quit\r");
-    assert_eq!(first.end(), Some(0));
+    assert_eq!(first.end("quit\r"), Some(0));
     let history = fs::read_to_string(folder.join("state/fric/history")).unwrap();
     assert!(history.contains("21 mm * 2"), "{history}");
     let mut second = Terminal::new(&folder, &[]);
@@ -470,8 +469,7 @@ fn a_saved_file_is_run_again_where_it_was() {
     at.wait("4 m, margin 4 m");
     at.wait("anew: w");
     at.wait("waiting for fill.fric");
-    at.send("\x03");
-    assert_eq!(at.end(), Some(0));
+    assert_eq!(at.end("\x03"), Some(0));
 }
 
 /// The blocks marked `session` of a page, with their positions.

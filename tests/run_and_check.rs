@@ -123,13 +123,13 @@ fn originals() -> Vec<(String, String)> {
     all.map(|(path, text)| (path.file_name().unwrap().to_string_lossy().into_owned(), text)).collect()
 }
 
-/// The measured points that the examples import.
+/// The measured points and signal tables that the examples name.
 fn points() -> Texts {
     let mut points = Vec::new();
     for folder in std::fs::read_dir(root().join("examples")).unwrap() {
         for file in std::fs::read_dir(folder.unwrap().path()).into_iter().flatten() {
             let path = file.unwrap().path();
-            if path.extension().is_some_and(|extension| extension == "csv") {
+            if path.extension().is_some_and(|extension| extension == "csv" || extension == "dbc") {
                 let name = path.file_name().unwrap().to_string_lossy().into_owned();
                 points.push((name, std::fs::read_to_string(path).unwrap()));
             }
@@ -191,9 +191,8 @@ fn all_commands_name_one_largest_stable_step() {
         let mut loaded = compiler::load(name, text, &sources);
         let experiments = loaded.experiments();
         let Some(experiment) = experiments.first().map(|experiment| experiment.name.clone()) else { continue };
-        let Ok(explained) = compiler::explain_run(&mut loaded, &sources, &experiment, &Changes::default()) else {
-            panic!("{name}")
-        };
+        let explained = compiler::explain_run(&mut loaded, &sources, &experiment, &Changes::default());
+        let explained = explained.unwrap_or_else(|found| panic!("{name}: {}", words(&found)));
         let method = [Method::Euler, Method::Rk4, Method::Expo, Method::Implicit][random.below(4)];
         let cost = explained.steps.iter().find(|step| step.method == method).unwrap();
         // Among steps as long as the motion itself, stability is not monotonic.
@@ -229,6 +228,12 @@ fn a_rig_has_the_same_largest_stable_step() {
     let refusal = compiler::rig(&mut loaded, &sources, "bench", &Options::default(), &mut Vec::new()).err().unwrap();
     let needed = stable_up_to(stable(Method::Rk4).unwrap());
     assert!(words(&refusal).contains(&format!("a step of {needed}")), "{needed}: {}", words(&refusal));
+    // A condition that holds at rest does not end what is examined.
+    let switched = text.replace("  bus ", "  stop   when body.x < 1 rad, \"not in its place\"\n  bus ");
+    assert_ne!(switched, text);
+    let mut loaded = compiler::load("rig.fric", &switched, &sources);
+    let found = compiler::rig(&mut loaded, &sources, "bench", &Options::default(), &mut Vec::new()).err().unwrap();
+    assert_eq!(words(&found), words(&refusal));
     let text = text.replace("solver rk4", "solver expo");
     let mut loaded = compiler::load("rig.fric", &text, &sources);
     let ready = compiler::rig(&mut loaded, &sources, "bench", &Options::default(), &mut Vec::new()).unwrap();

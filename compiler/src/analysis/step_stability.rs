@@ -110,7 +110,8 @@ pub struct Bench<'a> {
     jacobian: Func,
     /// A step of `expo` for the states only.
     relaxing: Func,
-    /// Slots that are not 0 where the run would have ended.
+    /// Slots that are not 0 where the run would have ended, without those of conditions that hold at the start already,
+    /// such as an enabling switch at 0: they would exclude every point.
     ends: Vec<Slot>,
     n: usize,
     /// The block at the start point.
@@ -189,13 +190,16 @@ impl<'a> Bench<'a> {
         }
         run_once(&start, &mut base, &program.description.pool);
         let rows: Vec<Slot> = (0..n).map(|k| layout.derivatives.slot(k)).collect();
+        let outputs = expand(&program.outputs);
+        let mut at_rest = base.clone();
+        run_once(&outputs, &mut at_rest, &program.description.pool);
         Some(Bench {
             program,
-            outputs: expand(&program.outputs),
+            outputs,
             derivatives: expand(&program.derivatives),
             jacobian: derivative(program, &program.derivatives, &rows),
             relaxing: expand(&fixed_step::advance(program, Method::Expo)),
-            ends: ends.to_vec(),
+            ends: ends.iter().copied().filter(|slot| at_rest[slot.index()] == 0.0).collect(),
             n,
             base,
             scanned: OnceCell::new(),
