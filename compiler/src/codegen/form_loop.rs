@@ -18,7 +18,7 @@ use std::collections::{HashMap, HashSet};
 
 /// Maximum number of slots that a loop carries in registers. More would be spilled anyway, and the time of register
 /// allocation grows with the square of their number.
-const MAX_IN_REGISTERS: usize = 24;
+pub const MAX_IN_REGISTERS: usize = 24;
 
 /// Whether no iteration reads anything that an iteration writes: then one iteration is enough.
 pub fn is_idempotent(func: &Func) -> bool {

@@ -21,6 +21,7 @@ mod loop_distribution;
 mod specialise_modes;
 mod unswitch;
 mod form_loop;
+mod predictive_commoning;
 mod reroll;
 mod outline;
 mod hoist_invariants;

@@ -11,6 +11,7 @@ use crate::codegen::hoist_invariants::hoist_invariants;
 use crate::codegen::hoist_params::hoist_params;
 use crate::codegen::loop_distribution::loop_distribution;
 use crate::codegen::outline::outline;
+use crate::codegen::predictive_commoning::predictive_commoning;
 use crate::codegen::select_to_branch::select_to_branch;
 use crate::codegen::side_exit::side_exit;
 use crate::codegen::sink::sink;
@@ -39,7 +40,7 @@ const fn pass(name: &'static str, on: &'static [Form], run: fn(&mut Cfg, &Contex
 /// The passes, in order. First those that need the function in one block, then those that give it more, then those on any
 /// number of blocks.
 #[rustfmt::skip]
-pub static LATE: [Pass; 11] = [
+pub static LATE: [Pass; 12] = [
     pass("drop_counter", &[Single], |cfg, _| drop_counter(cfg),
         "leaves the step counter to the caller"),
     pass("hoist_params", &[Single], |cfg, context| _ = context.layout.map(|layout| hoist_params(cfg, layout)),
@@ -54,6 +55,8 @@ pub static LATE: [Pass; 11] = [
         "cuts the function into pieces; repeated parts become loops (reroll)"),
     pass("form_loop", &[Loop, Distributed], |cfg, _| form_loop(cfg),
         "wraps the step in a loop that carries its states in registers"),
+    pass("predictive_commoning", &[Loop, Distributed], |cfg, _| predictive_commoning(cfg),
+        "carries to the next step what the end of a step shares with its begin"),
     // After the loop, so that what only the status needs is not taken for an invariant.
     pass("side_exit", &[Single, Once, Loop, Distributed], |cfg, _| side_exit(cfg),
         "moves what only the status of a failed guard needs to a cold block"),
