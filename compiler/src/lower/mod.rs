@@ -281,10 +281,10 @@ impl<'a> Plan<'a> {
         .map(Output::Var)
         .collect();
         outputs.extend(watched.iter().copied().map(Output::Var));
-        // A plain name of a quantity with a slot needs no output slot.
-        let stored =
-            |id: VarId| !matches!(system.var(id).definition, Definition::Value(..)) || independent[id.0 as usize];
-        let named = |id: VarId, outputs: &mut Vec<Output>| match stored(id) {
+        // A plain name of a quantity with a slot needs no output slot. A parameter without a value has no slot.
+        let stored: HashSet<VarId> =
+            [&params, &inputs, &states, &sampled, &held].into_iter().flatten().copied().collect();
+        let named = |id: VarId, outputs: &mut Vec<Output>| match stored.contains(&id) {
             true => ObservedAt::Var(id),
             false => {
                 let known = outputs.iter().position(|output| matches!(output, Output::Var(other) if *other == id));
