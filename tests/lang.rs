@@ -431,17 +431,21 @@ fn mutated_texts_are_read_formatted_and_checked() {
     let first = count("FRIC_SEED", 0);
     let corpus = Arc::new(corpus());
     let workers = thread::available_parallelism().map_or(1, |n| n.get() as u64).min(total);
-    let mut running: Vec<(Arc<AtomicU64>, thread::JoinHandle<u64>)> = Vec::new();
+    let mut running = Vec::new();
     for worker in 0..workers {
         let at = Arc::new(AtomicU64::new(first + worker));
         let (progress, corpus) = (at.clone(), corpus.clone());
         let seeds = (first + worker..first + total).step_by(workers as usize);
         let thread = thread::Builder::new().stack_size(8 << 20).spawn(move || {
-            let tried = seeds.map(|seed| {
+            let (mut clean, mut failures) = (0, Vec::new());
+            for seed in seeds {
                 progress.store(seed, Ordering::Relaxed);
-                u64::from(mutation_is_answered(&corpus, seed))
-            });
-            tried.sum()
+                match mutation_is_answered(&corpus, seed) {
+                    Ok(without_diagnostics) => clean += u64::from(without_diagnostics),
+                    Err(failure) => failures.push(failure),
+                }
+            }
+            (clean, failures)
         });
         running.push((at, thread.unwrap()));
     }
@@ -461,14 +465,17 @@ fn mutated_texts_are_read_formatted_and_checked() {
             );
         }
     }
-    let ends = running.into_iter().map(|(_, thread)| thread.join());
-    let clean: u64 = ends.map(|clean| clean.unwrap_or_else(|panic| std::panic::resume_unwind(panic))).sum();
+    let ends = running.into_iter().map(|(_, thread)| thread.join().expect("panics are caught"));
+    let (clean, failures): (Vec<u64>, Vec<Vec<String>>) = ends.unzip();
+    let (clean, failures) = (clean.iter().sum::<u64>(), failures.concat());
+    assert!(failures.is_empty(), "{} of {total} texts: {}", failures.len(), failures.join("\n"));
     println!("{total} texts from seed {first} on, {clean} of them without a word to say");
     assert!(total < 100 || clean * 200 > total, "only {clean} of {total} were fine: mutations are too wild");
 }
 
-/// Parses, formats and checks the text of a seed; returns whether it has no diagnostics. Panics with the seed.
-fn mutation_is_answered(corpus: &[String], seed: u64) -> bool {
+/// Parses, formats and checks the text of a seed; returns whether it has no diagnostics, or the seed and the text at
+/// which something panicked.
+fn mutation_is_answered(corpus: &[String], seed: u64) -> Result<bool, String> {
     let text = mutated(corpus, &mut Chance(seed));
     let tried = catch_unwind(AssertUnwindSafe(|| {
         let (_, found) = checked("text.fric", &text, &Texts::default());
@@ -478,7 +485,7 @@ fn mutation_is_answered(corpus: &[String], seed: u64) -> bool {
         }
         found.is_empty()
     }));
-    tried.unwrap_or_else(|_| panic!("seed {seed} (FRIC_SEED={seed} FRIC_MUTATIONS=1):\n{text}"))
+    tried.map_err(|_| format!("seed {seed} (FRIC_SEED={seed} FRIC_MUTATIONS=1):\n{text}"))
 }
 
 /// A dimensionless expression over the names, safe to divide by where it is a divisor.

@@ -137,7 +137,7 @@ pub fn formulas(system: &System, types: &Types, exprs: &[ExprId]) -> (Func, usiz
     let from = plan.description.layout.size();
     for (k, expr) in exprs.iter().enumerate() {
         let value = emit.value(*expr);
-        let value = if types.boolean[expr.0 as usize] { emit.number(value) } else { value };
+        let value = emit.as_number(value);
         emit.build.store(Slot((from + k) as u32), value);
     }
     (crate::math::expand(&emit.build.finish()), from + exprs.len())
@@ -175,7 +175,7 @@ pub fn of_params(system: &System, types: &Types, sought: &[ParamValue]) -> (Prog
             ParamValue::Var(id) => emit.stored(*id),
             ParamValue::Expr(expr) => {
                 let value = emit.value(*expr);
-                emit.as_number(value, types.boolean[expr.0 as usize])
+                emit.as_number(value)
             }
         };
         emit.build.store(layout.outputs.slot(k), value);
@@ -201,7 +201,7 @@ fn evaluate_in(plan: &Plan, exprs: &[ExprId]) -> Vec<f64> {
     emit.inline_params = true;
     for (k, expr) in exprs.iter().enumerate() {
         let value = emit.value(*expr);
-        let value = if plan.types.boolean[expr.0 as usize] { emit.number(value) } else { value };
+        let value = emit.as_number(value);
         emit.build.store(Slot(Slot::FIXED + k as u32), value);
     }
     let func = emit.build.finish();
@@ -551,7 +551,7 @@ impl<'a> Plan<'a> {
                 unreachable!("it is sampled")
             };
             let value = emit.value(next);
-            let value = emit.as_number(value, self.types.boolean_vars[id.0 as usize]);
+            let value = emit.as_number(value);
             emit.build.store(self.slot(*id).expect("it is stored"), value);
         }
         for (block, slot) in self.system.blocks.iter().zip(&self.periods) {
@@ -583,11 +583,11 @@ impl<'a> Plan<'a> {
 
     fn outputs(&self, mut emit: Emit) -> Func {
         for (k, output) in self.outputs.iter().enumerate() {
-            let (value, boolean) = match output {
-                Output::Var(id) => (emit.var(*id), self.types.boolean_vars[id.0 as usize]),
-                Output::Expr(expr) => (emit.value(*expr), self.types.boolean[expr.0 as usize]),
+            let value = match output {
+                Output::Var(id) => emit.var(*id),
+                Output::Expr(expr) => emit.value(*expr),
             };
-            let value = emit.as_number(value, boolean);
+            let value = emit.as_number(value);
             emit.build.store(self.description.layout.outputs.slot(k), value);
         }
         emit.build.finish()
@@ -615,7 +615,7 @@ impl<'a> Plan<'a> {
             };
             let slot = self.slot(*id).expect("it is stored");
             let value = emit.value(next);
-            let value = emit.as_number(value, self.types.boolean_vars[id.0 as usize]);
+            let value = emit.as_number(value);
             let due = emit.due(block);
             let before = emit.build.load(slot);
             let value = emit.build.select(due, value, before);
@@ -632,7 +632,7 @@ impl<'a> Plan<'a> {
         let mut note = |emit: &mut Emit, fires: Value, list: &[(VarId, ExprId)]| {
             for (var, value) in list {
                 let value = emit.value(*value);
-                let value = emit.as_number(value, self.types.boolean_vars[var.0 as usize]);
+                let value = emit.as_number(value);
                 let all = resets.entry(*var).or_insert_with(|| {
                     order.push(*var);
                     Vec::new()
@@ -1071,7 +1071,7 @@ impl<'a> Emit<'a> {
     /// An operand as a quantity; see [`condition`](Self::condition).
     fn quantity(&mut self, id: ExprId) -> Value {
         let value = self.got(id);
-        if self.build.type_of(value) == Type::Bool { self.number(value) } else { value }
+        self.as_number(value)
     }
 
     /// The value of a computed quantity. At a tick, a held quantity is updated only if its block is due.
@@ -1109,7 +1109,7 @@ impl<'a> Emit<'a> {
     /// As [`var`](Self::var), in its stored form: a number.
     fn stored(&mut self, id: VarId) -> Value {
         let value = self.var(id);
-        self.as_number(value, self.plan.types.boolean_vars[id.0 as usize])
+        self.as_number(value)
     }
 
     fn leaf(&mut self, id: VarId) -> Value {
@@ -1145,8 +1145,9 @@ impl<'a> Emit<'a> {
         self.build.select(condition, one, zero)
     }
 
-    fn as_number(&mut self, value: Value, boolean: bool) -> Value {
-        if boolean { self.number(value) } else { value }
+    /// A value as it is stored. Its own type decides, because in a text with errors the checker may call it otherwise.
+    fn as_number(&mut self, value: Value) -> Value {
+        if self.build.type_of(value) == Type::Bool { self.number(value) } else { value }
     }
 
     /// Whether a value varies during a run.

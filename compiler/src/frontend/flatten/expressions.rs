@@ -4,6 +4,11 @@
 
 use super::*;
 
+/// The longest end of a text of characters that `belongs` accepts.
+fn last_run(text: &str, belongs: impl Fn(char) -> bool) -> &str {
+    &text[text.trim_end_matches(belongs).len()..]
+}
+
 /// `an input`, `a param`
 fn kind_with_article(kind: DeclarationKind) -> String {
     let word = kind.word();
@@ -126,10 +131,9 @@ impl<'a> Flattener<'a> {
         let sign = if before.trim_end_matches(' ').ends_with('/') { '/' } else { '·' };
         let front = front.trim_end_matches(' ');
         let word = |c: char| c.is_ascii_alphanumeric() || matches!(c, '.' | '_');
-        let unit_start = front.rfind(|c: char| !word(c) && !matches!(c, '/' | '·' | '^')).map_or(0, |at| at + 1);
-        let (number, unit) = (&front[..unit_start], &front[unit_start..]);
-        let number = number.trim_end_matches(' ');
-        let number = &number[number.rfind(|c: char| !word(c)).map_or(0, |at| at + 1)..];
+        let unit = last_run(front, |c| word(c) || matches!(c, '/' | '·' | '^'));
+        let unit_start = front.len() - unit.len();
+        let number = last_run(front[..unit_start].trim_end_matches(' '), word);
         let power = behind
             .strip_prefix('^')
             .map_or("", |power| &behind[..1 + power.find(|c: char| !c.is_ascii_digit()).unwrap_or(power.len())]);
