@@ -60,6 +60,8 @@ pub enum Command {
     Test(Test),
     /// Run an experiment many times under other parameters: grids and Monte Carlo
     Sweep(Sweep),
+    /// Find the parameters with which a model follows a recording, with intervals
+    Fit(Fit),
     /// A, B, C, D and the modes of a model or an experiment at a point
     Linearise(Linearise),
     /// Time the step of an experiment: alone, in lanes, on all cores
@@ -119,7 +121,7 @@ pub enum Command {
     Man {
         /// Such as run
         #[arg(value_parser = [
-            "run", "test", "sweep", "linearise", "bench", "build", "hil", "replay", "check", "fmt", "explain",
+            "run", "test", "sweep", "fit", "linearise", "bench", "build", "hil", "replay", "check", "fmt", "explain",
             "characterise", "compare", "doc", "repl", "watch", "inspect", "key", "deploy", "fetch-log", "drives", "bus",
             "doctor", "predict", "bench-rt", "new", "completions",
         ])]
@@ -406,6 +408,47 @@ pub struct Sweep {
     #[arg(long, short)]
     pub quiet: bool,
     /// Interpret instead of compiling to machine code: same bits, slower
+    #[arg(long)]
+    pub interpret: bool,
+}
+
+/// `fric fit`
+#[derive(clap::Args, Debug)]
+pub struct Fit {
+    /// The text
+    #[arg(value_hint = ValueHint::FilePath)]
+    pub file: PathBuf,
+    /// The fits in it to find the parameters of [default: all]
+    #[arg(value_name = "FIT")]
+    pub fits: Vec<String>,
+    /// Fit another recording with the same columns
+    #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
+    pub data: Option<PathBuf>,
+    /// Probability with which an interval holds the true value
+    #[arg(long, value_name = "PERCENT", default_value = "95%", value_parser = level)]
+    pub level: f64,
+    /// Judge the values as they are written, and search for nothing
+    #[arg(long)]
+    pub check: bool,
+    /// What of the text is changed, and how steps are made
+    #[command(flatten)]
+    pub stepped: Stepped,
+    /// Relative tolerance of an adaptive run, such as 1e-9
+    #[arg(long, value_name = "NUMBER", value_parser = tolerance)]
+    pub tol: Option<f64>,
+    /// Folder of the files that are written: NAME.fric with the values found, NAME.json, NAME.csv and, of what the fit plots, NAME.svg
+    #[arg(long, value_name = "DIR", default_value = "out", value_hint = ValueHint::DirPath)]
+    pub out: PathBuf,
+    /// One JSON object for each fit, and no files
+    #[arg(long)]
+    pub json: bool,
+    /// Warnings count as failures
+    #[arg(long)]
+    pub strict: bool,
+    /// Print nothing but errors
+    #[arg(long, short)]
+    pub quiet: bool,
+    /// Interpret instead of making machine code: slow, for comparison
     #[arg(long)]
     pub interpret: bool,
 }
@@ -1043,6 +1086,17 @@ fn tolerance(text: &str) -> Result<f64, String> {
     match text.parse::<f64>() {
         Ok(tol) if tol > 0.0 && tol < 1.0 => Ok(tol),
         _ => Err("a number between 0 and 1 is needed, for example 1e-8".into()),
+    }
+}
+
+fn level(text: &str) -> Result<f64, String> {
+    let (number, percent) = match text.strip_suffix('%') {
+        Some(number) => (number, true),
+        None => (text, false),
+    };
+    match number.trim().parse::<f64>().map(|level| if percent { level / 100.0 } else { level }) {
+        Ok(level) if (0.5..=0.9999).contains(&level) => Ok(level),
+        _ => Err("a probability from 50% to 99.99% is needed, for example 95%".into()),
     }
 }
 

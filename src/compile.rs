@@ -16,8 +16,10 @@ use compiler::codegen::lanes;
 use compiler::codegen::target::{self, FunctionCompiler};
 use compiler::codegen::unsupported::Unsupported;
 use compiler::codegen::{c, image, jit};
+pub use compiler::experiment::of_fit::HELD;
 pub use compiler::experiment::spaced;
 pub use compiler::experiment::vary::{PreparedRun, Varying};
+pub use compiler::fit::{Asks, Fit, Item as FitItem, Unknown as FitUnknown, find as find_fit};
 pub use compiler::frontend::names::nearest;
 pub use compiler::frontend::resolve::{Lookup, Space};
 pub use compiler::frontend::system::LINTS;
@@ -25,7 +27,7 @@ use compiler::opt::reassociate;
 pub use compiler::rig::{StepDerivative, bus_load, dbc_messages, linear as linear_of};
 pub use compiler::{
     Built, Case, Changes, Loaded, Options, Ready, SourceFile, Sources, build, check, check_declarations, compile,
-    dissipation, explain, explain_in, explain_rig, explain_run, linear, load, quantities, rig, stepping, varying,
+    dissipation, explain, explain_in, explain_rig, explain_run, fit, linear, load, quantities, rig, stepping, varying,
 };
 use grammar::diagnostic::Diagnostic;
 use std::time::Instant;

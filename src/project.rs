@@ -142,6 +142,17 @@ fn tidy(path: &Path) -> PathBuf {
     out
 }
 
+/// The path of a file as seen from a folder.
+pub fn relative(file: &Path, folder: &Path) -> String {
+    let whole = |path: &Path| std::path::absolute(path).unwrap_or_else(|_| path.to_path_buf());
+    let (file, folder) = (whole(file), whole(folder));
+    let (file, folder): (Vec<Component>, Vec<Component>) = (file.components().collect(), folder.components().collect());
+    let common = file.iter().zip(&folder).take_while(|(a, b)| a == b).count();
+    let up = std::iter::repeat_n("..".to_string(), folder.len() - common);
+    let down = file[common..].iter().map(|part| part.as_os_str().to_string_lossy().into_owned());
+    up.chain(down).collect::<Vec<_>>().join("/")
+}
+
 /// All `.fric` files in a folder and its subfolders, sorted by name. Hidden and generated files are skipped: names that
 /// begin with a dot, and folders called `target` or `out`.
 ///

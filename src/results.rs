@@ -154,7 +154,8 @@ fn reading_json(reading: &Reading) -> Value {
     })
 }
 
-fn verdict_json(verdict: &Verdict) -> Value {
+/// A verdict as a JSON object.
+pub fn verdict_json(verdict: &Verdict) -> Value {
     let margin = verdict.margin.as_ref();
     let part = |of: fn(&Margin) -> f64| margin.map(|margin| number(margin.unit.from_si(of(margin))));
     json!({

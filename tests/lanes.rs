@@ -71,7 +71,7 @@ fn compare(varying: &Varying, path: &str, runs: usize, low: f64, by: f64) -> usi
 fn in_lanes_and_alone(varying: &Varying, path: &str, values: &[f64]) -> Vec<Result<Outcome, Failure>> {
     let runs = values.len();
     let slot = varying.param(path).expect("it is a parameter").slot;
-    let fitted = |k: usize| varying.fit(&[(slot, values[k])]).expect("the values fit");
+    let fitted = |k: usize| varying.at(&[(slot, values[k])]).expect("the values fit");
     let lanes = varying.lanes().expect("this processor has lanes, and so has the model");
     let mut found: Vec<Option<Result<Outcome, Failure>>> = vec![None; runs];
     let mut left = 0..runs;

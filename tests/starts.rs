@@ -54,7 +54,7 @@ fn varied(text: &str, name: &str, path: &str, value: f64, typical: &str, method:
     let cases = compiler::varying(&mut loaded(text), &Texts::default(), name, &options, &mut Vec::new());
     let cases = cases.map_err(|found| format!("{found:?}"))?;
     let param = cases[0].param(path).expect("a state can be varied");
-    let fitted = cases[0].fit(&[(param.slot, value)])?;
+    let fitted = cases[0].at(&[(param.slot, value)])?;
     end_of(fitted.instance, &fitted.experiment)
 }
 

@@ -33,7 +33,7 @@ fn may_vary(loaded: &mut Loaded, name: &str, path: &str, value: f64) -> Result<E
     let cases = compiler::varying(loaded, &Texts::default(), name, &options, &mut Vec::new()).map_err(|_| ())?;
     let case = &cases[0];
     let param = case.param(path).ok_or(())?;
-    let Ok(fitted) = case.fit(&[(param.slot, param.unit.to_si(value))]) else { return Ok(None) };
+    let Ok(fitted) = case.at(&[(param.slot, param.unit.to_si(value))]) else { return Ok(None) };
     let description = fitted.instance.description().clone();
     let Ok(outcome) = run(fitted.instance, &fitted.experiment, &mut |_| Continue::Continue(())) else {
         return Ok(None);

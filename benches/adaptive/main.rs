@@ -201,7 +201,7 @@ fn sweep(name: &str, rosenbrock: &Path, tolerances: [(f64, f64); 2]) {
     for (tol_ours, tol_c) in tolerances {
         let run = |k: usize| {
             let rise = 0.5 * (0.9 + 0.2 * k as f64 / RUNS as f64);
-            let fitted = varying.fit(&[(slot, rise)]).expect("any rise will do");
+            let fitted = varying.at(&[(slot, rise)]).expect("any rise will do");
             let mut experiment = fitted.experiment;
             experiment.solver.tol = tol_ours;
             (fitted.instance, experiment)

@@ -24,6 +24,7 @@ pub mod analysis;
 pub mod pipeline;
 pub mod rig;
 pub mod experiment;
+pub mod fit;
 #[cfg(test)]
 mod soundness;
 
@@ -98,27 +99,48 @@ pub fn varying(
     if let Some(error) = variants.iter().find_map(|variant| experiment::vary::built_in(variant, &varied(variant))) {
         return Err(vec![error]);
     }
-    let one = |variant: experiment::Variant| {
-        let paths = &varied(&variant);
-        // The description keeps its ranges. The code of a fixed step drops the guards of those that the runs change.
-        let mut coded = variant.program.clone();
-        coded.description.guards = experiment::vary::in_code(&variant, paths);
-        let functions = functions(&coded, variant.experiment.solver.method);
-        let (code, notes) = code(&functions, &coded.description, options.interpret);
-        let alone = options.interpret || variant.experiment.bench.is_some();
-        let lanes = if alone { None } else { codegen::tiering::lanes(&coded, variant.experiment.solver.method) };
-        let adaptive = variant.adaptive.as_ref().map(|program| {
-            let code = codegen::tiering::on_demand(program, Method::Adaptive, options.interpret);
-            Arc::new(Instance::new(Arc::new(program.description.clone()), code, &program.params))
-        });
-        experiment::vary::Varying::new(
-            variant,
-            paths,
-            &loaded.files,
-            experiment::vary::Runnable { code, lanes, adaptive, notes },
-        )
-    };
-    Ok(variants.into_iter().map(one).collect())
+    Ok(variants.into_iter().map(|variant| varied_code(loaded, variant, options)).collect())
+}
+
+/// Compiles a fit: its experiment for many runs that differ in the values of its unknowns.
+///
+/// # Errors All errors of the fit and of the models it runs.
+pub fn fit(
+    loaded: &mut Loaded,
+    sources: &dyn Sources,
+    name: &str,
+    options: &Options,
+    warnings: &mut Vec<Diagnostic>,
+) -> Result<fit::Fit, Vec<Diagnostic>> {
+    let (variant, asks, paths) = fit::read(loaded, sources, name, &options.changes, warnings)?;
+    if let Some(error) = experiment::vary::built_in(&variant, &paths) {
+        return Err(vec![error]);
+    }
+    let mut options = options.clone();
+    options.changes.vary = paths;
+    Ok(fit::Fit { varying: varied_code(loaded, variant, &options), asks })
+}
+
+/// Code for runs of an experiment that differ in the values of the parameters in `options.changes.vary`.
+fn varied_code(loaded: &Loaded, variant: experiment::Variant, options: &Options) -> experiment::vary::Varying {
+    let paths = &experiment::start_values::params(&variant.system, &options.changes.vary);
+    // The description keeps its ranges. The code of a fixed step drops the guards of those that the runs change.
+    let mut coded = variant.program.clone();
+    coded.description.guards = experiment::vary::in_code(&variant, paths);
+    let functions = functions(&coded, variant.experiment.solver.method);
+    let (code, notes) = code(&functions, &coded.description, options.interpret);
+    let alone = options.interpret || variant.experiment.bench.is_some();
+    let lanes = if alone { None } else { codegen::tiering::lanes(&coded, variant.experiment.solver.method) };
+    let adaptive = variant.adaptive.as_ref().map(|program| {
+        let code = codegen::tiering::on_demand(program, Method::Adaptive, options.interpret);
+        Arc::new(Instance::new(Arc::new(program.description.clone()), code, &program.params))
+    });
+    experiment::vary::Varying::new(
+        variant,
+        paths,
+        &loaded.files,
+        experiment::vary::Runnable { code, lanes, adaptive, notes },
+    )
 }
 
 /// A model or an experiment as one program, for uses other than a run (C, images, listings).
@@ -641,16 +663,16 @@ pub fn check(loaded: &mut Loaded, sources: &dyn Sources) -> Vec<Diagnostic> {
                     Err(errors) => {
                         // Declarations of an unreadable statement are missing in the experiment too; their absence is
                         // not reported again.
-                        let missing = |d: &Diagnostic| {
-                            matches!(d.code, "E0106" | "E0203" | "E0204" | "E0205" | "E0206" | "E0303" | "E0501")
-                        };
-                        all.extend(errors.into_iter().filter(|d| !(gaps && missing(d))));
+                        all.extend(errors.into_iter().filter(|d| !gaps || !MISSING.contains(&d.code)));
                     }
                 }
             }
             Item::Fit(fit) => {
-                let error = Diagnostic::error("E0905", format!("`fit {}` is not available yet", fit.name.text));
-                all.push(error.label(fit.name.span, "reserved for the fitting of parameters"));
+                let mut warnings = Vec::new();
+                match fit::read(loaded, sources, &fit.name.text, &Changes::default(), &mut warnings) {
+                    Ok(_) => all.extend(warnings),
+                    Err(errors) => all.extend(errors.into_iter().filter(|d| !gaps || !MISSING.contains(&d.code))),
+                }
             }
             Item::Rig(rig) => {
                 let mut warnings = Vec::new();
@@ -699,6 +721,9 @@ fn check_declaration(loaded: &Loaded, sources: &dyn Sources, item: &Item, physic
         Item::Experiment(_) | Item::Fit(_) | Item::Rig(_) | Item::Import(_) | Item::Device(_) => {}
     }
 }
+
+/// Errors that may follow from an unreadable declaration.
+const MISSING: [&str; 7] = ["E0106", "E0203", "E0204", "E0205", "E0206", "E0303", "E0501"];
 
 /// Limit on the combinations of one experiment whose steps are checked.
 const MOST_STEPPED: usize = 4;

@@ -589,9 +589,31 @@ pub struct Fit {
 pub enum FitStatement {
     Experiment(ExperimentStatement),
     /// `vary Fs in 1 N .. 2 N, vs`
-    Vary(Vec<(Path, Option<Range>)>, Span),
-    /// `minimise rms(F - data.F)`
-    Minimise(Expr, Span),
+    Vary(Vec<Vary>, Span),
+    Minimise(Minimise),
+}
+
+/// `Fc = 0.8 N in 0.1 N .. 10 N`, `m = 1 kg +- 0.1 kg`
+#[derive(Clone, PartialEq, Debug)]
+#[allow(missing_docs)]
+pub struct Vary {
+    pub path: Path,
+    /// Where the search starts; with `known`, also the value that is known.
+    pub start: Option<Expr>,
+    /// The standard deviation with which `start` is known.
+    pub known: Option<Expr>,
+    pub range: Option<Range>,
+    pub span: Span,
+}
+
+/// `minimise rms(F - data.F) / 5 mN, rms(x - data.x) after 0.1 s`
+#[derive(Clone, PartialEq, Debug)]
+#[allow(missing_docs)]
+pub struct Minimise {
+    pub items: Vec<Expr>,
+    pub after: Option<Expr>,
+    pub before: Option<Expr>,
+    pub span: Span,
 }
 
 /// `device Panel { … }` or `device Transducer from "shaft.dbc" message ShaftTorque`

@@ -505,7 +505,8 @@ impl<'s, 't> Layout<'s, 't> {
                     let signal = matches!(self.source.word(start), "send" | "read");
                     let wire = self.kind(line).0 == "equation";
                     let fits = match word {
-                        "in" => self.source.word(start) != "plot",
+                        // A `vary` lists several parameters, each with its range; so does a `plot` its curves.
+                        "in" => !matches!(self.source.word(start), "plot" | "vary"),
                         "limit" | "slew" => wire,
                         _ => signal,
                     };

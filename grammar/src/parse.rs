@@ -808,16 +808,25 @@ impl<'t> Reader<'t> {
                 Rule::allow => ExperimentStatement::Allow(self.allow(pair)),
                 Rule::vary => {
                     let items = children.all(Rule::vary_item).into_iter().map(|item| {
+                        let (span, is_known) = (self.span(&item), says(&item, Rule::margin));
                         let mut children = Children::of(item);
-                        (self.path(children.one()), children.maybe(Rule::range).map(|range| self.range(range)))
+                        let path = self.path(children.one());
+                        let start = self.maybe_value(&mut children);
+                        let known = is_known.then(|| self.value(&mut children));
+                        let range = children.maybe(Rule::range).map(|range| self.range(range));
+                        Vary { path, start, known, range, span }
                     });
                     let items = items.collect();
                     body.push(FitStatement::Vary(items, span));
                     continue;
                 }
                 Rule::minimise => {
-                    let value = self.value(&mut children);
-                    body.push(FitStatement::Minimise(value, span));
+                    let [after, before] = [Rule::kw_after, Rule::kw_before].map(|word| says(&pair, word));
+                    let mut items: Vec<Expr> =
+                        children.all(Rule::expr).into_iter().map(|value| self.expr(value)).collect();
+                    let before = if before { items.pop() } else { None };
+                    let after = if after { items.pop() } else { None };
+                    body.push(FitStatement::Minimise(Minimise { items, after, before, span }));
                     continue;
                 }
                 rule => unreachable!("{rule:?} is no statement of an experiment"),

@@ -415,7 +415,7 @@ impl<'t> Source<'t> {
             let derivative = equals > at + 1 && self.is_symbol(at + 1, "/");
             let case = matches!(self.word(first), "expect" | "show")
                 && (before == "for" || before == "," && (first..at).any(|mark| self.is_word(mark, "for")));
-            let listed = case || self.is_word(first, "safe") && before == ",";
+            let listed = case || matches!(self.word(first), "safe" | "vary") && before == ",";
             return !head && !listed && begins(ended || derivative);
         }
         !inside && fresh && ended && !CONTINUATIONS.contains(&word)

@@ -21,6 +21,8 @@ mod solver;
 
 pub mod engine;
 
+pub mod fit;
+
 pub mod image;
 pub mod package;
 

@@ -9,7 +9,7 @@ use crate::terminal::{Style, Terminal};
 use crate::vary::{How, Vary};
 use crate::{project, report};
 use serde_json::{Value, json};
-use std::path::{Component, Path, PathBuf};
+use std::path::{Path, PathBuf};
 
 pub fn characterise(args: &Characterise, terminal: &mut Terminal) -> End {
     let found = match subjects(&args.what, &args.models, &args.set, args.out.as_deref()) {
@@ -200,7 +200,7 @@ pub(super) fn fitted(written: Written, file: Option<&Path>, folder: &Path) -> Re
     let (origin, own) = match file {
         None => (Origin::Library, String::new()),
         Some(path) => {
-            let path = relative(path, folder);
+            let path = project::relative(path, folder);
             (Origin::File(path.clone()), format!("import \"{path}\"\n"))
         }
     };
@@ -279,17 +279,6 @@ fn compiled(loaded: &Loaded, name: &str) -> Result<Vec<compile::Case>, String> {
     let options = Options { changes: Changes::default(), interpret: true };
     compile::compile(&mut loaded, &crate::disk::Disk, name, &options, &mut Vec::new(), &mut |_| ())
         .map_err(|found| report::full(&loaded.files.0, &found, false))
-}
-
-/// The path of a file as seen from a folder.
-fn relative(file: &Path, folder: &Path) -> String {
-    let whole = |path: &Path| std::path::absolute(path).unwrap_or_else(|_| path.to_path_buf());
-    let (file, folder) = (whole(file), whole(folder));
-    let (file, folder): (Vec<Component>, Vec<Component>) = (file.components().collect(), folder.components().collect());
-    let common = file.iter().zip(&folder).take_while(|(a, b)| a == b).count();
-    let up = std::iter::repeat_n("..".to_string(), folder.len() - common);
-    let down = file[common..].iter().map(|part| part.as_os_str().to_string_lossy().into_owned());
-    up.chain(down).collect::<Vec<_>>().join("/")
 }
 
 /// Writes the report, the battery, a table for each graph and the requested figures; returns how many of the last two.

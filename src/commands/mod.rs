@@ -25,6 +25,7 @@ mod repl;
 mod replay;
 mod run;
 mod sweep;
+mod fit;
 mod test;
 
 use crate::args::{self, Args, Command, Key, Repl};
@@ -71,6 +72,7 @@ pub fn run(args: &Args, begin: Instant, terminal: &mut Terminal) -> End {
             end
         }
         Command::Sweep(sweep) => sweep::sweep(sweep, terminal),
+        Command::Fit(args) => fit::fit(args, terminal),
         Command::Linearise(linearise) => linearise::linearise(linearise, terminal),
         Command::Bench(args) => bench::bench(args, terminal),
         Command::Build(build) => build::build(build, terminal),

@@ -351,7 +351,7 @@ impl Table {
         let (at, values) = self.values(number, dice);
         let given: Vec<(Slot, f64)> = self.slots[at].iter().copied().zip(values.iter().copied()).collect();
         let description = |fitted: &PreparedRun| fitted.instance.description().clone();
-        match self.cases[at].fit(&given) {
+        match self.cases[at].at(&given) {
             Ok(fitted) => Ok((Run { number, at, values, description: description(&fitted) }, fitted)),
             Err(broken) => Err(self.cells(number, at, &values, &[], &format!("not run: {broken}"))),
         }
@@ -676,7 +676,7 @@ fn stopped_by_ctrl_c() -> Arc<AtomicBool> {
 }
 
 /// Least and greatest value of a guarded range.
-fn extremes(watched: &Verdict) -> (f64, f64) {
+pub fn extremes(watched: &Verdict) -> (f64, f64) {
     let value = |k: usize| watched.readings.get(k).map_or(f64::NAN, |reading| reading.value);
     (value(0), value(1))
 }

@@ -3,6 +3,7 @@
 //! In: an experiment's syntax tree and changes from outside. Out: one [`Variant`] for each combination of its sweeps: a
 //! flat system, its program, and a plan that refers to slots only. Knows nothing of integration.
 
+pub mod of_fit;
 pub mod start_values;
 pub mod vary;
 
@@ -26,6 +27,7 @@ use abi::unit::{Dimension, Unit};
 use grammar::ast::{self, BinaryOp, ExperimentStatement, Expr, Spacing, SweepOver};
 use grammar::diagnostic::Diagnostic;
 use grammar::span::{FileId, Span};
+use std::borrow::Cow;
 use std::sync::Arc;
 
 /// Changes to an experiment from outside.
@@ -50,6 +52,8 @@ pub struct Changes {
     /// Does not check whether the step is stable, for questions that do not run the experiment, and for a run that is
     /// only compared with it.
     pub any_step: bool,
+    /// A file that replaces the recording of a fit, as an absolute path.
+    pub data: Option<String>,
     /// Omits the experiment's own expectations. A question at the prompt does not judge the run, and a window of an
     /// expectation may lie beyond the compiled duration.
     pub unjudged: bool,
@@ -96,6 +100,12 @@ pub struct Variant {
     pub ports: PortSlots,
     /// For software in the loop: the rig.
     pub rig: Option<SimulatedRig>,
+    /// Of a fit: the times of the rows of its recording in s, from 0.
+    pub rows: Vec<f64>,
+    /// Of a fit: the time of the first row in the file, in s.
+    pub begins: f64,
+    /// Of a fit: its recording has no times; each row is a steady point.
+    pub steady: bool,
 }
 
 /// A rig that an experiment runs against its own plant.
@@ -152,27 +162,38 @@ pub fn read(
     on_stage: &mut dyn FnMut(&'static str),
 ) -> Result<Vec<Variant>, Vec<Diagnostic>> {
     let mut diagnostics = Vec::new();
-    let given = CommandLine::read(loaded, changes, &mut diagnostics);
+    let mut given = CommandLine::read(loaded, changes, &mut diagnostics);
     let also = also(loaded, &changes.also, &mut diagnostics);
     let root = loaded.root();
     let prepared = rig_of(loaded, sources, name, &given, &mut diagnostics)?;
     let loaded = &*loaded;
     let file = loaded.files.get(root);
+    let mut fit = None;
     let found = file.ast.items().find_map(|item| match item {
-        ast::Item::Experiment(experiment) if experiment.name.text == name => Some(experiment),
+        ast::Item::Experiment(experiment) if experiment.name.text == name => Some(Cow::Borrowed(experiment)),
+        ast::Item::Fit(one) if one.name.text == name => {
+            fit = Some(one);
+            Some(Cow::Owned(of_fit::experiment_of(one)))
+        }
         _ => None,
     });
-    let Some(experiment) = found else {
+    let Some(mut experiment) = found else {
         let error = Diagnostic::error("E0201", format!("there is no experiment `{name}`"));
         return Err(vec![error.label(Span::new(root, 0, 0), "in this file")]);
     };
     let misread = loaded.misread(experiment.span);
-    let mut experiment = std::borrow::Cow::Borrowed(experiment);
     if changes.unjudged {
         experiment.to_mut().body.retain(|statement| !matches!(statement, ExperimentStatement::Expect(_)));
     }
     if !also.is_empty() {
         experiment.to_mut().body.extend(also);
+    }
+    if let (Some(file), Some(_)) = (&changes.data, fit) {
+        for statement in &mut experiment.to_mut().body {
+            if let ExperimentStatement::Data(data) = statement {
+                data.file.text.clone_from(file);
+            }
+        }
     }
     let experiment = &*experiment;
     // The missing `run` may be a misspelt word, which has been reported.
@@ -185,8 +206,28 @@ pub fn read(
     let said: Vec<String> =
         given.set.iter().map(|set| path(&set.path)).chain(given.vary.iter().map(|p| plain(p))).collect();
     parts.sweeps.retain(|sweep| !said.contains(&path(&sweep.path)));
-    let data = parts.data.map_or(Some(Vec::new()), |data| recording(loaded, sources, root, data, &mut diagnostics));
-    let Some(data) = data else { return Err(diagnostics) };
+    let steady = fit.is_some() && parts.data.is_some_and(of_fit::is_steady);
+    let data =
+        parts.data.map_or(Some(Vec::new()), |data| recording(loaded, sources, root, data, steady, &mut diagnostics));
+    let Some(mut data) = data else { return Err(diagnostics) };
+    let (mut rows, mut begins) = (Vec::new(), 0.0);
+    if let (Some(fit), Some((_, first, _))) = (fit, data.first()) {
+        if steady {
+            rows = of_fit::hold(&mut data);
+        } else {
+            begins = first.x.first().copied().unwrap_or(0.0);
+            rows = match of_fit::interval(&first.x) {
+                // Rounded times are put on their grid.
+                Some(interval) => (0..first.x.len()).map(|k| k as f64 * interval).collect(),
+                None => first.x.iter().map(|t| t - begins).collect(),
+            };
+            data.iter_mut().for_each(|(_, table, _)| table.x.clone_from(&rows));
+        }
+        if parts.solver.is_none() && given.method.is_none() && given.step.is_none() {
+            let (method, step, tol) = of_fit::default_solver(fit, &rows, steady);
+            (given.method, given.step, given.tol) = (Some(method), step, given.tol.or(tol));
+        }
+    }
     let grids = grids(loaded, &parts, &mut diagnostics);
     if diagnostics.iter().any(Diagnostic::is_error) {
         return Err(diagnostics);
@@ -250,7 +291,7 @@ pub fn read(
             warnings,
             on_stage,
         ) {
-            Ok(variant) => variants.push(variant),
+            Ok(variant) => variants.push(Variant { rows: rows.clone(), begins, steady, ..variant }),
             Err(errors) => return Err(errors),
         }
     }
@@ -412,21 +453,23 @@ fn parts<'a>(
     Some(Statements { span: experiment.span, run, solver, sweeps, data, plots, expects, stepped, allowed })
 }
 
-/// Columns of a recording as tables over time.
+/// Columns of a recording as tables over time. Those of steady points have no times yet.
 fn recording(
     loaded: &Loaded,
     sources: &dyn Sources,
     root: FileId,
     data: &ast::Data,
+    steady: bool,
     diagnostics: &mut Vec<Diagnostic>,
 ) -> Option<Vec<(String, Table, Unit)>> {
-    let Some(time) = data.columns.iter().position(|column| column.name.text == "t") else {
+    let time = data.columns.iter().position(|column| column.name.text == "t");
+    if time.is_none() && !steady {
         let error = Diagnostic::error("E0903", "a recording needs a column `t`").label(data.span, "no column is time");
         let help =
             "name the columns in the order of the file or by their headings, as in `(t [s], x [mm] = \"Position\")`";
         diagnostics.push(error.help(help));
         return None;
-    };
+    }
     let mut wanted = Vec::new();
     for (k, column) in data.columns.iter().enumerate() {
         let name = column.name.text.as_str();
@@ -456,22 +499,10 @@ fn recording(
     }
     let mut values = columns_of(loaded, sources, root, &data.file, &wanted, diagnostics)?;
     let seconds = Dimension::of([0, 0, 1, 0, 0]);
-    let (t, unit) = &values[time];
-    if unit.dimension != seconds {
-        let column = &data.columns[time];
-        let is = if unit.dimension.is_none() { "no unit".to_string() } else { format!("{unit}") };
-        let error = Diagnostic::error("E0903", "the column `t` of a recording is a time").label(column.name.span, is);
-        diagnostics.push(error.help("write its unit, as in `t [s]` or `t [ms]`"));
-        return None;
-    }
-    let t = t.clone();
-    if let Some(row) = (1..t.len()).find(|&row| t[row].partial_cmp(&t[row - 1]) != Some(std::cmp::Ordering::Greater)) {
-        let shown = |t: f64| format!("{} {unit}", unit.from_si(t));
-        let label = format!("row {}: {} after {}", row + 1, shown(t[row]), shown(t[row - 1]));
-        let error = Diagnostic::error("E0903", "the times of a recording must increase").label(data.file.span, label);
-        diagnostics.push(error.help("is `t` the column that was meant? Sort the rows, and keep one for each time"));
-        return None;
-    }
+    let t = match time {
+        Some(time) => times(data, (time, &values[time].0, &values[time].1), diagnostics)?,
+        None => Vec::new(),
+    };
     let named = data.columns.iter().zip(values.drain(..)).filter(|(column, _)| column.name.text != "_");
     let table = |(column, (y, unit)): (&ast::Column, (Vec<f64>, Unit))| {
         let name = column.name.text.clone();
@@ -486,6 +517,29 @@ fn recording(
         (name, table, unit)
     };
     Some(named.map(table).collect())
+}
+
+/// The times of a recording in s, from the column with this number; they increase.
+fn times(
+    data: &ast::Data,
+    (at, t, unit): (usize, &[f64], &Unit),
+    diagnostics: &mut Vec<Diagnostic>,
+) -> Option<Vec<f64>> {
+    if unit.dimension != Dimension::of([0, 0, 1, 0, 0]) {
+        let column = &data.columns[at];
+        let is = if unit.dimension.is_none() { "no unit".to_string() } else { format!("{unit}") };
+        let error = Diagnostic::error("E0903", "the column `t` of a recording is a time").label(column.name.span, is);
+        diagnostics.push(error.help("write its unit, as in `t [s]` or `t [ms]`"));
+        return None;
+    }
+    if let Some(row) = (1..t.len()).find(|&row| t[row].partial_cmp(&t[row - 1]) != Some(std::cmp::Ordering::Greater)) {
+        let shown = |t: f64| format!("{} {unit}", unit.from_si(t));
+        let label = format!("row {}: {} after {}", row + 1, shown(t[row]), shown(t[row - 1]));
+        let error = Diagnostic::error("E0903", "the times of a recording must increase").label(data.file.span, label);
+        diagnostics.push(error.help("is `t` the column that was meant? Sort the rows, and keep one for each time"));
+        return None;
+    }
+    Some(t.to_vec())
 }
 
 /// The values of each sweep over a grid, `first .. last by step`, as literals.
@@ -576,7 +630,7 @@ fn rounded(x: f64) -> f64 {
 }
 
 /// A literal in SI units, its unit and the unit as written.
-fn quantity(expr: &Expr) -> Option<(f64, Unit, Option<ast::UnitText>)> {
+pub fn quantity(expr: &Expr) -> Option<(f64, Unit, Option<ast::UnitText>)> {
     match &expr.kind {
         ast::ExprKind::Number { value, unit: None } => Some((*value, Unit::none(), None)),
         ast::ExprKind::Number { value, unit: Some(text) } => {
@@ -973,7 +1027,8 @@ fn variant<'a>(
     });
     let outputs = ports.outputs.iter().zip(ports_at).map(|((path, _), at)| (path.clone(), slots[at]));
     let ports = (inputs.collect(), outputs.collect());
-    Ok(Variant { label, system, types, program, adaptive, experiment, places, ports, rig })
+    let (rows, begins, steady) = (Vec::new(), 0.0, false);
+    Ok(Variant { label, system, types, program, adaptive, experiment, places, ports, rig, rows, begins, steady })
 }
 
 /// The rig that an experiment runs, with its descriptions; `None` if it runs a model.

@@ -174,6 +174,16 @@ impl Varying {
         }
     }
 
+    /// The description of its program.
+    pub fn description(&self) -> &Description {
+        &self.description
+    }
+
+    /// Whether its code has a length of memory that the step determines.
+    pub fn keeps_past(&self) -> bool {
+        !self.description.delays.is_empty()
+    }
+
     /// The code that steps many runs at once, if available.
     pub fn lanes(&self) -> Option<&Lanes> {
         self.lanes.as_ref()
@@ -181,9 +191,7 @@ impl Varying {
 
     /// The parameter of this path, or the one for the start value of the state of this path, if a run can set it.
     pub fn param(&self, path: &str) -> Option<&Quantity> {
-        let start = self.description.quantity(&start_values::path(path));
-        let found = start.or_else(|| self.description.quantity(path))?;
-        (found.kind == Kind::Param && self.description.layout.params.contains(found.slot)).then_some(found)
+        param_of(&self.description, path)
     }
 
     /// Number of the experiment's expectations. Later verdicts concern ranges; see [`Varying::left`].
@@ -194,7 +202,7 @@ impl Varying {
     /// An instance and a plan for these values in SI units.
     ///
     /// # Errors The violated condition, in words.
-    pub fn fit(&self, values: &[(Slot, f64)]) -> Result<PreparedRun, String> {
+    pub fn at(&self, values: &[(Slot, f64)]) -> Result<PreparedRun, String> {
         let mut instance = Instance::new(self.description.clone(), self.code.clone(), &self.params);
         if let Some(adaptive) = &self.adaptive {
             instance = instance.with_adaptive(adaptive.clone());
@@ -303,6 +311,13 @@ impl Varying {
             })
         })
     }
+}
+
+/// The parameter of this path, or the one for the start value of the state of this path, if a run can set it.
+pub fn param_of<'d>(description: &'d Description, path: &str) -> Option<&'d Quantity> {
+    let start = description.quantity(&start_values::path(path));
+    let found = start.or_else(|| description.quantity(path))?;
+    (found.kind == Kind::Param && description.layout.params.contains(found.slot)).then_some(found)
 }
 
 /// An error if a parameter cannot vary between runs of one program, because it determines what is compiled.

@@ -154,6 +154,17 @@ impl Loaded {
         self.files.get(self.root()).ast.items().filter_map(experiment).collect()
     }
 
+    /// Names of the fits of the root file, in order.
+    pub fn fits(&self) -> Vec<&str> {
+        let items = self.files.get(self.root()).ast.items();
+        items
+            .filter_map(|item| match item {
+                Item::Fit(fit) => Some(fit.name.text.as_str()),
+                _ => None,
+            })
+            .collect()
+    }
+
     /// Rigs of the root file, in order.
     pub fn rigs(&self) -> Vec<&ast::Rig> {
         let items = self.files.get(self.root()).ast.items();

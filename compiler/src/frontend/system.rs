@@ -482,6 +482,10 @@ pub const LINTS: &[(&str, &str)] = &[
     ("dbc-unit", "W0806"),
     ("no-drive-timeout", "W0807"),
     ("recording-ends", "W0901"),
+    ("unidentified", "W0910"),
+    ("at-bound", "W0902"),
+    ("rough", "W0906"),
+    ("unsettled", "W0911"),
 ];
 
 impl System {

@@ -3,13 +3,13 @@
 //! In: runs, delivered one by one. Out: the outcome of each, bit-identical to running it alone. When a run needs
 //! attention, its block is copied out of the lane and back; when a run ends, its lane takes the next one.
 
-use crate::engine::{Failure, Outcome, ended, start};
-use crate::run::observe::Observer;
+use crate::engine::{Failure, Outcome, bare, ended, failed, start};
+use crate::run::observe::{Observer, Probe};
 use crate::run::outcome::{Continue, Stop};
-use crate::run::stepper::Stepper;
-use abi::Instance;
+use crate::run::stepper::{Rest, Stepper};
 use abi::lanes::{Batch, Lanes};
 use abi::plan::Experiment;
+use abi::{Instance, Slot};
 
 /// The answer to a request for another run.
 pub enum Next<T> {
@@ -38,6 +38,54 @@ pub fn run<T>(
     give: &mut dyn FnMut(T, Result<Outcome, Failure>),
     watch: &mut dyn FnMut(f64) -> Continue,
 ) {
+    let mut ended = |tag, rest, result| give(tag, ended(rest, result));
+    observed(lanes, &Observer::new, next, &mut ended, watch);
+}
+
+/// The rows of a run up to where it ended, and how it ended.
+pub type Sampled = (Vec<f64>, Result<(), Failure>);
+
+/// Values of `slots` at instants in s, ascending, row-major, for each of the runs: as [`sample`](crate::engine::sample)
+/// gives them for one, to the bit.
+///
+/// # Panics
+/// As [`engine::run`](crate::engine::run).
+pub fn sample(
+    lanes: &Lanes,
+    runs: Vec<(Instance, Experiment)>,
+    instants: &[f64],
+    slots: &[Slot],
+    watch: &mut dyn FnMut(f64) -> Continue,
+) -> Vec<Sampled> {
+    let mut all: Vec<Option<Sampled>> = runs.iter().map(|_| None).collect();
+    let mut left = runs.into_iter().enumerate();
+    let mut next = |_| match left.next() {
+        Some((number, (instance, experiment))) => Next::Run(number, Box::new((instance, bare(&experiment)))),
+        None => Next::Nothing,
+    };
+    let observer = |experiment: &Experiment| {
+        let mut observer = Observer::new(experiment);
+        observer.probe = Probe::new(instants, slots);
+        observer
+    };
+    let mut give = |number: usize, rest: Rest, result: Result<(), Stop>| {
+        all[number] = Some((rest.observer.probe.values(), result.map_err(failed)));
+    };
+    observed(lanes, &observer, &mut next, &mut give, watch);
+    all.into_iter().map(|one| one.expect("every run ends")).collect()
+}
+
+/// Passes the parts of a run that has ended to the caller.
+type Give<'g, T> = dyn FnMut(T, Rest, Result<(), Stop>) + 'g;
+
+/// Runs everything that `next` delivers, each with an observer of its own.
+fn observed<T>(
+    lanes: &Lanes,
+    observer: &dyn Fn(&Experiment) -> Observer,
+    next: &mut dyn FnMut(bool) -> Next<T>,
+    give: &mut Give<T>,
+    watch: &mut dyn FnMut(f64) -> Continue,
+) {
     let mut batch = Batch::new(lanes.clone());
     let mut all: Vec<Option<Lane<T>>> = (0..batch.width()).map(|_| None).collect();
     // Idle lanes whose contents may end a step with a status.
@@ -49,7 +97,10 @@ pub fn run<T>(
         for lane in 0..all.len() {
             while more && all[lane].is_none() {
                 match next(all.iter().any(Option::is_some)) {
-                    Next::Run(tag, what) => all[lane] = begin(tag, *what, &mut batch, (lane, total), give, watch),
+                    Next::Run(tag, what) => {
+                        let observer = observer(&what.1);
+                        all[lane] = begin(tag, *what, observer, &mut batch, (lane, total), give, watch);
+                    }
                     Next::Later => break,
                     Next::Nothing => more = false,
                 }
@@ -82,7 +133,7 @@ pub fn run<T>(
             if let Some(result) = lane.look(&mut batch, (number, total), status, watch) {
                 let lane = place.take().expect("it was there");
                 astray[number] = true;
-                give(lane.tag, ended(lane.course.rest(), result));
+                give(lane.tag, lane.course.rest(), result);
             }
         }
         calm = if looked { 0 } else { calm + done };
@@ -102,16 +153,17 @@ struct Lane<T> {
 fn begin<T>(
     tag: T,
     (instance, experiment): (Instance, Experiment),
+    observer: Observer,
     batch: &mut Batch,
     (number, total): (usize, u64),
-    give: &mut dyn FnMut(T, Result<Outcome, Failure>),
+    give: &mut Give<T>,
     watch: &mut dyn FnMut(f64) -> Continue,
 ) -> Option<Lane<T>> {
-    let mut course = match start(instance, &experiment, Observer::new(&experiment), &mut |_| ()) {
+    let mut course = match start(instance, &experiment, observer, &mut |_| ()) {
         Ok(course) => course,
         Err(failed) => {
             let (rest, stop) = *failed;
-            give(tag, ended(rest, Err(stop)));
+            give(tag, rest, Err(stop));
             return None;
         }
     };
@@ -121,7 +173,7 @@ fn begin<T>(
             Some(Lane { tag, course, since: total, until: total.saturating_add(left) })
         }
         result => {
-            give(tag, ended(course.rest(), result.map(|_| ())));
+            give(tag, course.rest(), result.map(|_| ()));
             None
         }
     }

@@ -71,11 +71,10 @@ pub fn sample(
     slots: &[Slot],
     watch: &mut dyn FnMut(f64) -> Continue,
 ) -> (Vec<f64>, Result<(), Failure>) {
-    let bare = Experiment { plots: Vec::new(), expects: Vec::new(), ..experiment.clone() };
+    let bare = bare(experiment);
     let mut observer = Observer::new(&bare);
     observer.probe = Probe::new(instants, slots);
     let (rest, result) = go(instance, &bare, observer, &mut |_| (), watch);
-    let failed = |stop: Stop| Failure { cause: stop.cause, time: stop.time, recording: Recording::default() };
     (rest.observer.probe.values(), result.map_err(failed))
 }
 
@@ -96,8 +95,17 @@ pub fn every_step(
     let mut observer = Observer::new(&bare);
     observer.recorder = Recorder::whole(&bare.plots, MOST_NUMBERS);
     let (rest, result) = go(instance, &bare, observer, &mut |_| (), watch);
-    let failed = |stop: Stop| Failure { cause: stop.cause, time: stop.time, recording: Recording::default() };
     (rest.observer.recorder.all(), result.map_err(failed))
+}
+
+/// The experiment without measures and recordings.
+fn bare(experiment: &Experiment) -> Experiment {
+    Experiment { plots: Vec::new(), expects: Vec::new(), ..experiment.clone() }
+}
+
+/// A failure of a run that records nothing.
+fn failed(stop: Stop) -> Failure {
+    Failure { cause: stop.cause, time: stop.time, recording: Recording::default() }
 }
 
 /// Runs to the end, or to the reason why not.

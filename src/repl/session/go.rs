@@ -332,7 +332,7 @@ impl Session {
             let part = k as f64 / (POINTS - 1) as f64;
             let x =
                 if 2 * k + 1 == POINTS { 0.5 * (first.si + last.si) } else { first.si + (last.si - first.si) * part };
-            let fitted = varying.fit(&[(slot, x)])?;
+            let fitted = varying.at(&[(slot, x)])?;
             let mut instance = fitted.instance;
             if steady {
                 instance.start(0.0);

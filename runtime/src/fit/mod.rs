@@ -1,0 +1,16 @@
+//! Estimates parameters from recordings: maximum likelihood of the output error, with a model of the noise.
+//!
+//! In: unknowns with their ranges, and a function that runs the model and returns what it computes minus what was
+//! measured, row by row. Out: values, intervals, correlations, and what the data do not determine. Knows neither
+//! models nor files.
+
+pub mod unknowns;
+pub mod quantiles;
+pub mod least_squares;
+pub mod trust_region;
+pub mod noise;
+pub mod estimate;
+
+pub use estimate::{Answer, Item, Question, Trouble, fit};
+pub use trust_region::Ended;
+pub use unknowns::{Elementary, Unknown};

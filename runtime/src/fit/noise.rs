@@ -1,0 +1,126 @@
+//! A model of the noise of a measurement: autoregressive, its order by an information criterion.
+//!
+//! In: the residuals of a fit, row by row. Out: an AR(p) model, p ≤ 8, and the filter that makes residuals and their
+//! derivatives white. Sources: Burg's method (Kay, Modern Spectral Estimation, sec. 7.4); BIC (Schwarz 1978).
+
+use crate::fit::unknowns::Elementary;
+
+/// Highest order.
+pub const MOST_ORDER: usize = 8;
+
+/// r(t) = Σ a(k) r(t − k) + e(t).
+#[derive(Clone, PartialEq, Debug)]
+pub struct Noise {
+    /// The coefficients a(1), a(2), …; empty for white noise.
+    pub coefficients: Vec<f64>,
+    /// Variance of the residuals.
+    pub variance: f64,
+    /// Variance of e as a fraction of that of the residuals.
+    pub innovation: f64,
+}
+
+impl Noise {
+    /// White noise of this variance.
+    pub fn white(variance: f64) -> Noise {
+        Noise { coefficients: Vec::new(), variance, innovation: 1.0 }
+    }
+
+    /// The model of these residuals.
+    pub fn of(residuals: &[f64], with: &Elementary) -> Noise {
+        let n = residuals.len();
+        let variance = residuals.iter().map(|r| r * r).sum::<f64>() / n.max(1) as f64;
+        let mut noise = Noise::white(variance);
+        if variance <= 0.0 || variance.is_nan() {
+            return noise;
+        }
+        let most = MOST_ORDER.min(n / 10);
+        let (mut forward, mut backward) = (residuals.to_vec(), residuals.to_vec());
+        let (mut a, mut power): (Vec<f64>, f64) = (Vec::new(), 1.0);
+        let criterion = |power: f64, order: usize| n as f64 * (with.log)(power) + order as f64 * (with.log)(n as f64);
+        let mut least = criterion(power, 0);
+        for order in 1..=most {
+            let (mut product, mut square) = (0.0, 0.0);
+            for t in order..n {
+                product += forward[t] * backward[t - 1];
+                square += forward[t] * forward[t] + backward[t - 1] * backward[t - 1];
+            }
+            if square == 0.0 {
+                break;
+            }
+            let k = 2.0 * product / square;
+            for t in (order..n).rev() {
+                let (f, b) = (forward[t], backward[t - 1]);
+                (forward[t], backward[t]) = (f - k * b, b - k * f);
+            }
+            a = (0..order - 1).map(|i| a[i] - k * a[order - 2 - i]).chain([k]).collect();
+            power *= 1.0 - k * k;
+            if power <= 0.0 || power.is_nan() {
+                break;
+            }
+            let now = criterion(power, order);
+            if now < least {
+                least = now;
+                (noise.coefficients, noise.innovation) = (a.clone(), power);
+            }
+        }
+        noise
+    }
+
+    /// Number of rows that the filter uses up.
+    pub fn order(&self) -> usize {
+        self.coefficients.len()
+    }
+
+    /// Filters a series and divides it by the standard deviation of e. The first p rows, which have no past, are left
+    /// out.
+    pub fn whitened(&self, series: &[f64]) -> Vec<f64> {
+        let scale = 1.0 / (self.variance * self.innovation).sqrt();
+        let p = self.order();
+        let one = |t: usize| {
+            let predicted: f64 = self.coefficients.iter().enumerate().map(|(k, a)| a * series[t - 1 - k]).sum();
+            scale * (series[t] - predicted)
+        };
+        (p..series.len()).map(one).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::fit::unknowns::tests::PLATFORM;
+    use crate::rng::Chance;
+
+    /// A normal variate: the sum of twelve uniform ones, less 6.
+    fn normal(chance: &mut Chance) -> f64 {
+        (0..12).map(|_| chance.fraction()).sum::<f64>() - 6.0
+    }
+
+    #[test]
+    fn the_order_and_coefficients_of_a_process_are_found() {
+        for (seed, a) in [vec![], vec![0.9], vec![0.5, -0.6], vec![1.2, -0.8, 0.3]].into_iter().enumerate() {
+            let mut chance = Chance(seed as u64);
+            let mut series: Vec<f64> = Vec::new();
+            for t in 0..20_000 {
+                let past: f64 = a.iter().enumerate().filter(|(k, _)| t > *k).map(|(k, a)| a * series[t - 1 - k]).sum();
+                series.push(past + normal(&mut chance));
+            }
+            let noise = Noise::of(&series, &PLATFORM);
+            assert_eq!(noise.order(), a.len(), "{a:?}: {noise:?}");
+            for (found, expected) in noise.coefficients.iter().zip(&a) {
+                assert!((found - expected).abs() < 0.03, "{a:?}: {noise:?}");
+            }
+            let white = noise.whitened(&series);
+            let variance = white.iter().map(|e| e * e).sum::<f64>() / white.len() as f64;
+            assert!((variance - 1.0).abs() < 1e-3, "{a:?}: variance {variance}");
+            assert!((noise.variance * noise.innovation - 1.0).abs() < 0.04, "{a:?}: {noise:?}");
+            assert!(Noise::of(&white, &PLATFORM).order() == 0, "{a:?}: white after the filter");
+        }
+    }
+
+    #[test]
+    fn nothing_and_constants_are_white() {
+        for series in [vec![], vec![0.0; 50], vec![1.0; 3]] {
+            assert_eq!(Noise::of(&series, &PLATFORM).order(), 0, "{series:?}");
+        }
+    }
+}
