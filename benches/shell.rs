@@ -130,23 +130,8 @@ fn go(case: &Case) -> u64 {
     outcome.map_err(|failure| failure.to_string()).expect("it runs").work.steps
 }
 
-/// LuGre friction on a mass that a spring pulls, as in the bench of adaptive runs.
-const PULL: &str = "model Bristle {
-  input  v [m/s]
-  state  z [um] = 0
-  let    g = 1 N + 0.5 N * exp(-(v / 1 mm/s)^2)
-  dz/dt = v - 1e5 N/m * abs(v) / g * z
-  output F [N] = 1e5 N/m * z + 316.22776601683796 N·s/m * dz/dt + 0.4 N·s/m * v
-}
-model Pull {
-  state  x [m]   = 0
-  state  v [m/s] = 0
-  part   fr = Bristle(v = v)
-  dx/dt = v
-  dv/dt = (2 N/m * (0.1 m/s * t - x) - fr.F) / 1 kg
-}
-experiment stick_slip { run Pull() for 20 s  expect final(x) > 0 m }
-";
+/// LuGre friction on a mass that a spring pulls.
+const PULL: &str = include_str!("adaptive/bristle.fric");
 
 /// A single run: with new code by wall clock, which includes the wait for code and a start of all functions; with its
 /// code made and interpreted, in processor time.
@@ -155,7 +140,7 @@ fn cold() {
     for tol in [1e-4, 1e-6, 1e-9] {
         let case = |interpret| {
             let changes = Changes { tol: Some(tol), ..Changes::default() };
-            compiled("pull.fric", PULL, "stick_slip", changes, interpret)
+            compiled("bristle.fric", PULL, "stick_slip", changes, interpret)
         };
         let (mut new, mut steps) = (Vec::new(), 0);
         for _ in 0..ROUNDS {

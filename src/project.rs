@@ -21,14 +21,19 @@ pub fn library() -> &'static [(&'static str, &'static str)] {
 const MOST_BYTES: u64 = 64 << 20;
 
 /// The name of the standard input, and of the standard output, in the place of a file.
-pub const STANDARD: &str = "-";
+const STANDARD: &str = "-";
+
+/// Whether a path stands for the standard input or output.
+pub fn is_standard(path: &Path) -> bool {
+    path == Path::new(STANDARD)
+}
 
 /// Reads a text; `-` is the standard input.
 ///
 /// # Errors
 /// Why not, in words.
 pub fn read(path: &Path) -> Result<String, String> {
-    if path == Path::new(STANDARD) {
+    if is_standard(path) {
         // It can be read once only.
         static INPUT: OnceLock<Result<String, String>> = OnceLock::new();
         return INPUT.get_or_init(read_input).clone();

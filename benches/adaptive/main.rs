@@ -21,35 +21,7 @@ use runtime::engine::{self, Continue, Failure, Outcome};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-const TEXT: &str = r#"
-model Bristle {
-  input  v [m/s]
-  param  rise = 0.5 N
-  state  z [um] = 0
-  let    g = 1 N + rise * exp(-(v / 1 mm/s)^2)
-  dz/dt = v - 1e5 N/m * abs(v) / g * z
-  output F [N] = 1e5 N/m * z + 316.22776601683796 N·s/m * dz/dt + 0.4 N·s/m * v
-}
-model Pull {
-  state  x [m]   = 0
-  state  v [m/s] = 0
-  part   fr = Bristle(v = v)
-  dx/dt = v
-  dv/dt = (2 N/m * (0.1 m/s * t - x) - fr.F) / 1 kg
-}
-model Pid {
-  state  x [m]   = 0
-  state  v [m/s] = 0
-  state  i [N]   = 0
-  let    u = 3 N/m * (1 m - x) + i - 6 N·s/m * v
-  part   fr = Bristle(v = v)
-  di/dt = 4 N/m/s * (1 m - x)
-  dx/dt = v
-  dv/dt = (u - fr.F) / 1 kg
-}
-experiment stick_slip { run Pull() for 20 s  expect final(x) > 0 m }
-experiment hunting { run Pid() for 100 s  expect final(x) > 0 m }
-"#;
+const TEXT: &str = include_str!("bristle.fric");
 
 const INSTANTS: usize = 200;
 const ROUNDS: usize = 15;

@@ -11,8 +11,8 @@
 //! ; A sentence: what must happen and what must not.
 //! ```
 //!
-//! A pass is one of [`PASSES`], `expand`, or one of [`LATE`], from which on the function is a graph. `BLESS=1 cargo test
-//! --test ir` writes what the passes make now: read that diff as code.
+//! A pass is one of [`PASSES`], `expand`, or one of [`LATE`]; the latter work on a graph. `BLESS=1 cargo test --test ir`
+//! writes the present output of the passes: read that diff as code.
 
 use abi::plan::Method;
 use abi::{Layout, Slot};

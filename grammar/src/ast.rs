@@ -527,7 +527,7 @@ pub struct Plot {
     pub span: Span,
 }
 
-/// `x [mm] as "position" in 0 mm .. 5 mm log`: a quantity of a plot, and how its axis looks.
+/// `x [mm] as "position" in 0 mm .. 5 mm log`: a quantity of a plot with its axis.
 #[derive(Clone, PartialEq, Debug)]
 #[allow(missing_docs)]
 pub struct Curve {

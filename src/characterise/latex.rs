@@ -285,7 +285,7 @@ mod tests {
         assert_eq!(quantity("2"), "2");
     }
 
-    /// Braces are balanced and every environment ends, for every model of the library's battery of symbols.
+    /// Braces are balanced and every environment ends, for random formulas of symbols.
     #[test]
     fn random_formulas_keep_braces_balanced() {
         const PIECES: [&str; 20] = [

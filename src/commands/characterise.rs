@@ -67,10 +67,8 @@ fn family(args: &Characterise, over: &Vary, terminal: &mut Terminal) -> End {
             Err(why) => return failed(terminal, &why),
         };
         for (subject, own) in found {
-            let label = subject.instance.label();
-            match study(subject, &battery_in(&own), &crate::disk::Disk, Extent::Whole) {
-                Ok(study) => studies.push(study),
-                Err(why) => end = failed(terminal, &format!("{label} {why}")),
+            if add(&mut studies, subject, &own, terminal) != End::Fine {
+                end = End::Failed;
             }
             folder = own;
         }
@@ -91,14 +89,24 @@ pub fn compare(args: &Compare, terminal: &mut Terminal) -> End {
             Err(why) => return failed(terminal, &why),
         };
         for (subject, _) in found {
-            let label = subject.instance.label();
-            match study(subject, &battery_in(&folder), &crate::disk::Disk, Extent::Whole) {
-                Ok(study) => studies.push(study),
-                Err(why) => end = failed(terminal, &format!("{label} {why}")),
+            if add(&mut studies, subject, &folder, terminal) != End::Fine {
+                end = End::Failed;
             }
         }
     }
     compared(&studies, &folder, &args.figures, args.json, end, terminal)
+}
+
+/// Characterises a subject with the battery in a folder, and adds its study.
+fn add(studies: &mut Vec<Study>, subject: Subject, folder: &Path, terminal: &Terminal) -> End {
+    let label = subject.instance.label();
+    match study(subject, &battery_in(folder), &crate::disk::Disk, Extent::Whole) {
+        Ok(study) => {
+            studies.push(study);
+            End::Fine
+        }
+        Err(why) => failed(terminal, &format!("{label} {why}")),
+    }
 }
 
 /// Writes the page of several models and prints their table. `end`: how their characterisation ended.

@@ -31,7 +31,7 @@ pub fn run(args: &Run, timings: &mut Timings, terminal: &mut Terminal) -> End {
         }
     };
     let standard = [("--plot", &args.plot), ("--data", &args.data)]
-        .map(|(option, file)| file.as_deref().filter(|file| *file == Path::new(project::STANDARD)).map(|_| option));
+        .map(|(option, file)| file.as_deref().filter(|file| project::is_standard(file)).map(|_| option));
     if let ([Some(_), Some(_)], _) | ([Some(_), _] | [_, Some(_)], true) = (standard, args.json) {
         terminal.error("only one of --plot -, --data - and --json can have the standard output");
         return End::Misused;
@@ -78,13 +78,17 @@ pub fn run(args: &Run, timings: &mut Timings, terminal: &mut Terminal) -> End {
             return End::Failed;
         }
         let picture = plot::picture(&args.look.titled(figure), &args.look.look(), Kind::of(path).unwrap_or(Kind::Svg));
-        match project::write(path, &picture) {
-            Ok(()) if !args.quiet && !args.json => terminal.line(&format!("wrote {}", path.display())),
-            Ok(()) => {}
-            Err(error) => {
-                terminal.error(&format!("cannot write {}: {error}", path.display()));
-                return End::Failed;
-            }
+        let mut written = Written::default();
+        if let Err((path, error)) = written.put(path, &picture, "") {
+            terminal.error(&format!("cannot write {}: {error}", path.display()));
+            return End::Failed;
+        }
+        terminal.bytes(&written.output);
+        if !args.quiet && !args.json && !written.names.is_empty() {
+            terminal.line(&format!("wrote {}", written.names.join(", ")));
+        }
+        if args.open {
+            show(Some(path).filter(|path| !project::is_standard(path)).map(PathBuf::as_path), terminal);
         }
     }
     end
@@ -118,7 +122,7 @@ fn experiment(
     terminal: &mut Terminal,
 ) -> End {
     let file = args.file.display().to_string();
-    let standard = |file: &Option<PathBuf>| file.as_deref() == Some(Path::new(project::STANDARD));
+    let standard = |file: &Option<PathBuf>| file.as_deref().is_some_and(project::is_standard);
     let to_output = standard(&args.plot) || standard(&args.data);
     let talking = !args.json && !args.quiet && !to_output;
     let (cases, stages) = match compiled(loaded, name, options, before, talking, terminal) {
@@ -237,16 +241,13 @@ fn experiment(
         }
     }
     match written {
-        Ok((written, output)) => {
-            terminal.bytes(&output);
-            if args.open {
-                match shown_picture(args, name, picture) {
-                    Some(picture) => open(&picture, terminal),
-                    None => terminal.report("--open: no plot was written to a file\n"),
-                }
+        Ok(written) => {
+            terminal.bytes(&written.output);
+            if args.open && together.is_none() {
+                show(written.picture.as_deref(), terminal);
             }
-            if talking && !written.is_empty() {
-                terminal.line(&format!("  wrote {}\n", written.join(", ")));
+            if talking && !written.names.is_empty() {
+                terminal.line(&format!("  wrote {}\n", written.names.join(", ")));
             }
             if passed { End::Fine } else { End::Failed }
         }
@@ -274,19 +275,43 @@ fn drawn(name: &str, cases: &[Case], recorded: &[Recorded], look: &args::Look) -
     Some(look.titled(figure::figure(name, &subtitle, 0, recorded)))
 }
 
-/// The picture that was written to a file.
-fn shown_picture(args: &Run, name: &str, picture: Option<&PathBuf>) -> Option<PathBuf> {
-    let by_default = args.plot.is_none() && args.data.is_none() && !args.json;
-    let folder = args.out.clone().or(by_default.then(|| PathBuf::from("out")));
-    let own = picture.filter(|path| path.as_path() != Path::new(project::STANDARD)).cloned();
-    own.or(folder.map(|folder| folder.join(format!("{name}.svg")))).filter(|path| path.is_file())
+/// The files that have been written.
+#[derive(Default)]
+struct Written {
+    /// Their paths, each with a remark if it has one.
+    names: Vec<String>,
+    /// The path of a plot.
+    picture: Option<PathBuf>,
+    /// What goes to the standard output.
+    output: Vec<u8>,
+}
+
+impl Written {
+    /// Writes a file, or keeps the bytes for the standard output. Returns the path that cannot be written, and why.
+    fn put(&mut self, path: &Path, bytes: &[u8], remark: &str) -> Result<(), (PathBuf, String)> {
+        if project::is_standard(path) {
+            self.output.extend_from_slice(bytes);
+            return Ok(());
+        }
+        project::write(path, bytes).map_err(|error| (path.to_path_buf(), error.to_string()))?;
+        self.names.push(format!("{}{remark}", path.display()));
+        Ok(())
+    }
+}
+
+/// Shows a plot with the desktop's program, if one was written.
+fn show(picture: Option<&Path>, terminal: &mut Terminal) {
+    match picture {
+        Some(picture) => open(picture, terminal),
+        None => terminal.report("--open: no plot was written to a file\n"),
+    }
 }
 
 /// Most rows of the data that the default folder gets without being asked.
 const UNASKED_ROWS: u64 = 100_000;
 
-/// Writes the requested files; returns their paths and remarks and what goes to the standard output, or the one that failed and why. `grids`: the instants of
-/// each case in s, if rows are requested on a time grid.
+/// Writes the requested files, or returns the one that failed and why. `grids`: the instants of each case in s, if rows
+/// are requested on a time grid.
 fn write(
     args: &Run,
     name: &str,
@@ -295,23 +320,15 @@ fn write(
     grids: &[Vec<f64>],
     drawn: Option<&Figure>,
     picture: Option<&PathBuf>,
-) -> Result<(Vec<String>, Vec<u8>), (PathBuf, String)> {
+) -> Result<Written, (PathBuf, String)> {
     let by_default = args.plot.is_none() && args.data.is_none() && !args.json;
     let folder = args.out.clone().or(by_default.then(|| PathBuf::from("out")));
-    let (mut written, mut output) = (Vec::new(), Vec::new());
-    let Some(figure) = drawn else { return Ok((written, output)) };
-    let mut put = |path: &Path, bytes: &[u8], remark: &str| {
-        if path == Path::new(project::STANDARD) {
-            output.extend_from_slice(bytes);
-            return Ok(());
-        }
-        project::write(path, bytes).map_err(|error| (path.to_path_buf(), error.to_string()))?;
-        written.push(format!("{}{remark}", path.display()));
-        Ok(())
-    };
+    let mut written = Written::default();
+    let Some(figure) = drawn else { return Ok(written) };
     for path in folder.iter().map(|folder| folder.join(format!("{name}.svg"))).chain(picture.cloned()) {
         let bytes = plot::picture(figure, &args.look.look(), Kind::of(&path).unwrap_or(Kind::Svg));
-        put(&path, &bytes, "")?;
+        written.put(&path, &bytes, "")?;
+        written.picture = Some(path).filter(|path| !project::is_standard(path)).or(written.picture);
     }
     let tables: Vec<PathBuf> =
         folder.iter().map(|folder| folder.join(format!("{name}.csv"))).chain(args.data.clone()).collect();
@@ -327,10 +344,10 @@ fn write(
             let path = for_case(path, label);
             let format = Format::of(&path).unwrap_or(Format::Csv);
             let bytes = recording_files::bytes(&rows, format).map_err(|error| (path.clone(), error.to_string()))?;
-            put(&path, &bytes, &remark)?;
+            written.put(&path, &bytes, &remark)?;
         }
     }
-    Ok((written, output))
+    Ok(written)
 }
 
 /// The rows of the data of a case: every step, unless something else is requested; and a remark if some are left out.
@@ -382,7 +399,7 @@ fn for_case(path: &Path, label: &str) -> PathBuf {
     if words.is_empty() {
         return path.to_path_buf();
     }
-    if path == Path::new(project::STANDARD) {
+    if project::is_standard(path) {
         return path.to_path_buf();
     }
     let stem = path.file_stem().map(|stem| stem.to_string_lossy().into_owned()).unwrap_or_default();

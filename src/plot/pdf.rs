@@ -62,7 +62,7 @@ struct Font {
     ascent: f32,
     descent: f32,
     glyphs: GlyphRemapper,
-    /// The text of each glyph of the subset.
+    /// For each glyph of the subset, the characters that it stands for.
     texts: BTreeMap<u16, String>,
 }
 

@@ -25,10 +25,10 @@ const INK: &str = "#1f2328";
 const FAINT: &str = "#59636e";
 const GRID: &str = "#e4e7eb";
 const DASHES: [&[f64]; 3] = [&[], &[7.0, 4.0], &[2.0, 3.0]];
-/// Dash patterns where curves are told apart by dashes.
+/// Dash patterns where dashes distinguish the curves.
 const PRINT_DASHES: [&[f64]; 6] =
     [&[], &[8.0, 4.0], &[2.0, 3.0], &[10.0, 3.0, 2.0, 3.0], &[14.0, 4.0], &[10.0, 3.0, 2.0, 3.0, 2.0, 3.0]];
-/// Dash patterns of a curve that lies on one, two or three others: through its gaps they show.
+/// Dash patterns of a curve that covers one, two or three others, which show through its gaps.
 const ON_OTHERS: [&[f64]; 3] = [&[8.0, 8.0], &[4.0, 12.0], &[2.0, 14.0]];
 
 /// The figure as SVG text.

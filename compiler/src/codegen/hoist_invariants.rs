@@ -1,11 +1,11 @@
-//! Hoists loop invariants: operations that no step changes move from the loop to the block before it.
+//! Hoists loop invariants: operations that no step changes move from the loop to its preheader.
 //!
 //! In: a loop in the shape of `form_loop`. Out: the same loop, in which each iteration computes only what may have
 //! changed. Cold blocks keep their operations. It knows nothing of processors.
 //!
 //! Source: Aho, Lam, Sethi, Ullman, *Compilers*, 2007, sec. 9.5.
 
-use crate::ir::cfg::{Area, BlockId, Cfg, Inst, Place, Terminator};
+use crate::ir::cfg::{Area, BlockId, Cfg, Inst, Place};
 use crate::ir::variance::{Slots, Variance, of_ops};
 use abi::Slot;
 use std::collections::HashSet;
@@ -14,11 +14,7 @@ use std::collections::HashSet;
 pub fn hoist_invariants(cfg: &mut Cfg) {
     let order = cfg.order(BlockId(0));
     let Some(head) = cfg.head(&order) else { return };
-    let before = |block: &&BlockId| match &cfg.blocks[block.index()].end {
-        Terminator::Jump(target) => target.block == head,
-        _ => false,
-    };
-    let Some(before) = order.iter().find(before).copied() else { return };
+    let Some(preheader) = cfg.preheader(head, &order) else { return };
     let insts = || cfg.blocks.iter().flat_map(|block| &block.insts);
     let stored = insts().filter_map(|inst| match inst {
         Inst::Store(Place { area: Area::Block, index, .. }, _) => Some(Slot(*index)),
@@ -36,7 +32,7 @@ pub fn hoist_invariants(cfg: &mut Cfg) {
     let body = std::mem::take(&mut cfg.blocks[head.index()].insts);
     let (hoisted, rest): (Vec<Inst>, Vec<Inst>) = body.into_iter().partition(is_hoisted);
     cfg.blocks[head.index()].insts = rest;
-    let prologue = &mut cfg.blocks[before.index()].insts;
+    let prologue = &mut cfg.blocks[preheader.index()].insts;
     prologue.extend(hoisted);
     // In the order of the straight line, in which operands precede their users.
     prologue.sort_by_key(|inst| if let Inst::Compute(value) = inst { *value } else { unreachable!("{inst:?}") });

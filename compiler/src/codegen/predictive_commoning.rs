@@ -1,5 +1,5 @@
-//! Predictive commoning: what one iteration computes from its results, and the next one would compute again from what it
-//! is handed, is computed once and carried from one to the other.
+//! Predictive commoning: a value that one iteration computes from its results, and that the next iteration would compute
+//! again from its arguments, is computed once and carried from one iteration to the next.
 //!
 //! In: a loop in the shape of `form_loop`. Out: the same loop with further carried values. A step ends with the outputs
 //! and guards of the new states and begins with the derivatives of the old ones; in a loop these are the same states, so
@@ -22,13 +22,8 @@ fn least_effort(count: usize) -> u32 {
 pub fn predictive_commoning(cfg: &mut Cfg) {
     let order = cfg.order(BlockId(0));
     let Some(head) = cfg.head(&order) else { return };
-    let goes_to_head = |block: &&BlockId| match &cfg.blocks[block.index()].end {
-        Terminator::Jump(target) => target.block == head,
-        _ => false,
-    };
     let repeats = |block: &&BlockId| matches!(cfg.blocks[block.index()].end, Terminator::Repeat { .. });
-    let (Some(before), Some(latch)) = (order.iter().find(goes_to_head).copied(), order.iter().find(repeats).copied())
-    else {
+    let (Some(preheader), Some(latch)) = (cfg.preheader(head, &order), order.iter().find(repeats).copied()) else {
         return;
     };
     let Terminator::Repeat { again, .. } = &cfg.blocks[latch.index()].end else { unreachable!("it repeats") };
@@ -38,7 +33,7 @@ pub fn predictive_commoning(cfg: &mut Cfg) {
     let candidates: HashSet<Value> = next.keys().copied().collect();
 
     let mut roots: Vec<Value> = Vec::new();
-    for block in order.iter().filter(|block| **block != before) {
+    for block in order.iter().filter(|block| **block != preheader) {
         let block = &cfg.blocks[block.index()];
         block.end.each_value(&mut |value| roots.push(value));
         let effects = block.insts.iter().filter(|inst| !matches!(inst, Inst::Compute(_) | Inst::Reload(..)));
@@ -71,13 +66,13 @@ pub fn predictive_commoning(cfg: &mut Cfg) {
         return;
     }
 
-    // The first ones are computed before the loop.
+    // The preheader computes the first ones.
     let first = needed(cfg, carried.iter().copied().collect(), &HashSet::new());
-    let there: HashSet<Value> = self::computed(cfg, before);
+    let there: HashSet<Value> = self::computed(cfg, preheader);
     let mut new: Vec<Value> =
         first.into_iter().filter(|value| !cfg.is_free(*value) && !there.contains(value)).collect();
     new.sort_unstable();
-    let block = &mut cfg.blocks[before.index()];
+    let block = &mut cfg.blocks[preheader.index()];
     block.insts.extend(new.into_iter().map(Inst::Compute));
     let Terminator::Jump(target) = &mut block.end else { unreachable!("it goes to the loop") };
     target.args.extend(&carried);
@@ -124,7 +119,7 @@ fn next_values(cfg: &Cfg, head: BlockId, handed: &HashMap<Value, Value>) -> Hash
     let always = needed(cfg, handed.values().copied().chain(tested).chain(written).collect(), &HashSet::new());
     let mut known: HashMap<Op, Value> = HashMap::new();
     for value in (0..cfg.ops.len() as u32).map(Value).filter(|value| computed.contains(value)) {
-        known.entry(normal(cfg.op(value))).or_insert(value);
+        known.entry(cfg.op(value).ordered()).or_insert(value);
     }
     let types = cfg.types();
     let mut is_variant = vec![false; cfg.ops.len()];
@@ -151,7 +146,7 @@ fn next_values(cfg: &Cfg, head: BlockId, handed: &HashMap<Value, Value>) -> Hash
             (false, _) => operand,
         });
         if is_variant[at] && whole {
-            next[at] = known.get(&normal(moved)).copied().filter(|next| always.contains(next));
+            next[at] = known.get(&moved.ordered()).copied().filter(|next| always.contains(next));
             let is_cheap = op.effort() == 0 || matches!(op, Op::Neg(_) | Op::Abs(_) | Op::ToBits(_));
             // A comparison costs less than a register.
             if let Some(next) = next[at]
@@ -164,23 +159,4 @@ fn next_values(cfg: &Cfg, head: BlockId, handed: &HashMap<Value, Value>) -> Hash
         }
     }
     found
-}
-
-/// The operation with the operands of a commutative one in order.
-fn normal(op: Op) -> Op {
-    match op {
-        Op::Add(a, b) if b < a => Op::Add(b, a),
-        Op::Mul(a, b) if b < a => Op::Mul(b, a),
-        Op::Fma(a, b, c) if b < a => Op::Fma(b, a, c),
-        Op::Equal(a, b) if b < a => Op::Equal(b, a),
-        Op::And(a, b) if b < a => Op::And(b, a),
-        Op::Or(a, b) if b < a => Op::Or(b, a),
-        Op::IntAdd(a, b) if b < a => Op::IntAdd(b, a),
-        Op::IntMul(a, b) if b < a => Op::IntMul(b, a),
-        Op::IntAnd(a, b) if b < a => Op::IntAnd(b, a),
-        Op::IntOr(a, b) if b < a => Op::IntOr(b, a),
-        Op::IntXor(a, b) if b < a => Op::IntXor(b, a),
-        Op::IntEqual(a, b) if b < a => Op::IntEqual(b, a),
-        op => op,
-    }
 }

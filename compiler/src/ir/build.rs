@@ -110,7 +110,7 @@ impl Build {
         if let Some(value) = self.equality_of_select(op).or_else(|| self.negated_quotient(op)) {
             return value;
         }
-        let op = self.ordered(op);
+        let op = op.ordered();
         if let Some(constant) = self.fold(op) {
             return self.share(constant);
         }
@@ -184,21 +184,6 @@ impl Build {
             Type::Int => Op::Int(bits as i64),
             Type::Bool => Op::Bool(bits != 0),
         })
-    }
-
-    /// Sorts the operands of a commutative operation, so that equal operations compare equal.
-    fn ordered(&self, op: Op) -> Op {
-        let sort = |a: Value, b: Value| if a <= b { (a, b) } else { (b, a) };
-        macro_rules! sorted {
-            ($($name:ident)*) => {
-                match op {
-                    $(Op::$name(a, b) => { let (a, b) = sort(a, b); Op::$name(a, b) })*
-                    Op::Fma(a, b, c) => { let (a, b) = sort(a, b); Op::Fma(a, b, c) }
-                    other => other,
-                }
-            };
-        }
-        sorted!(Add Mul Equal And Or IntAdd IntMul IntAnd IntOr IntXor IntEqual)
     }
 
     /// Identities that hold to the bit in IEEE 754 with round to nearest, if all NaN count as one value. Some are

@@ -329,6 +329,15 @@ impl Cfg {
         })
     }
 
+    /// The preheader of a loop among some blocks: the one that goes nowhere but to its head.
+    pub fn preheader(&self, head: BlockId, blocks: &[BlockId]) -> Option<BlockId> {
+        let enters = |block: &&BlockId| match &self.blocks[block.index()].end {
+            Terminator::Jump(target) => target.block == head,
+            _ => false,
+        };
+        blocks.iter().find(enters).copied()
+    }
+
     /// Appends a value that is only read back from memory and that no operation of the function computes.
     pub fn in_memory(&mut self) -> Value {
         self.ops.push(Op::Load(Slot(u32::MAX)));

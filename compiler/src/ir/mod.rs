@@ -255,6 +255,21 @@ impl Op {
         }
     }
 
+    /// The operation with the operands of a commutative one sorted, so that equal operations compare equal.
+    pub fn ordered(self) -> Op {
+        let sort = |a: Value, b: Value| if a <= b { (a, b) } else { (b, a) };
+        macro_rules! sorted {
+            ($($name:ident)*) => {
+                match self {
+                    $(Op::$name(a, b) => { let (a, b) = sort(a, b); Op::$name(a, b) })*
+                    Op::Fma(a, b, c) => { let (a, b) = sort(a, b); Op::Fma(a, b, c) }
+                    other => other,
+                }
+            };
+        }
+        sorted!(Add Mul Equal And Or IntAdd IntMul IntAnd IntOr IntXor IntEqual)
+    }
+
     /// Whether it is a constant.
     pub fn is_constant(self) -> bool {
         matches!(self, Op::Real(_) | Op::Int(_) | Op::Bool(_))

@@ -62,7 +62,7 @@ impl<'l> Slots<'l> {
     }
 }
 
-/// The variance of each value of a function. With a layout, parameters are told apart from inputs.
+/// The variance of each value of a function. A layout distinguishes parameters from inputs.
 pub fn variance(func: &Func, layout: Option<&Layout>) -> Vec<Variance> {
     of_ops(&func.ops, &Slots::of_func(func, layout), |_| Variance::Parameters)
 }

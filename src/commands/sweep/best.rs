@@ -1,4 +1,4 @@
-//! `--best`: by which measure the rows of a table are ranked, and how many are shown.
+//! `--best`: ranks the rows of a table by a measure and keeps the first ones.
 //!
 //! In: the words of the option. Out: a ranking. With distributions the rows of one point of the grid are ranked together,
 //! by a statistic of their values.
