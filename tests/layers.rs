@@ -59,6 +59,7 @@ const HOMES: &[(&str, &[&str])] = &[
     ("rtrb", &["runtime/src/spsc.rs"]),
     ("rustix", &["runtime/src/record/parts.rs"]),
     ("rustyline", &["src/repl/line.rs"]),
+    ("rustc-hash", &["compiler/src/hash.rs"]),
     // JSON is a form of every command's results.
     ("serde_json", &["src/"]),
     ("sha2", &["abi/src/image.rs"]),

@@ -177,7 +177,7 @@ fn same_bits(func: &Func, cfg: &Cfg, count: u64, start: &[f64], pool: &[f64]) ->
 fn with_outputs(rate: &Func) -> Func {
     let layout = random::layout();
     let mut build = Build::new("step");
-    let mut env = Env::new();
+    let mut env = Env::default();
     build.inline(rate, &mut env);
     env.retain(|slot, _| layout.states.contains(*slot));
     build.store_env(&env, |_| true);

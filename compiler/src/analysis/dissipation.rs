@@ -279,7 +279,7 @@ fn proved(system: &System, contact: &Contact, bench: &mut Bench) -> bool {
                 inputs.push((slot, Interval::closed(low, high)));
             }
             let build = Shared::new(Build::new("dissipation").with_pool(description.pool.clone()));
-            let mut env = Env::new();
+            let mut env = Env::default();
             {
                 let mut build = build.borrow_mut();
                 let held = (0..layout.size()).filter(|slot| inputs.iter().all(|(input, _)| input.index() != *slot));
@@ -459,7 +459,7 @@ fn sampled(system: &System, contact: &Contact, bench: &mut Bench) -> Verdict {
 fn depends(program: &Program, outputs: impl Iterator<Item = Slot>) -> Vec<bool> {
     let states: Vec<Slot> = program.description.layout.states.range().map(|slot| Slot(slot as u32)).collect();
     let build = Shared::new(Build::new("dependence"));
-    let gradients = autodiff::inline(&build, &program.outputs, &mut Env::new(), &states);
+    let gradients = autodiff::inline(&build, &program.outputs, &mut Env::default(), &states);
     let mut found = vec![false; states.len()];
     for (k, _) in outputs.filter_map(|slot| gradients.get(&slot)).flatten() {
         found[*k as usize] = true;
@@ -476,9 +476,9 @@ fn energy_flow(program: &Program, energy: Slot) -> Option<Func> {
     }
     let states: Vec<Slot> = (0..n).map(|k| layout.states.slot(k)).collect();
     let build = Shared::new(Build::new("energy flow"));
-    let gradients = autodiff::inline(&build, &program.outputs, &mut Env::new(), &states);
+    let gradients = autodiff::inline(&build, &program.outputs, &mut Env::default(), &states);
     let mut build = build.into_inner();
-    let mut env = Env::new();
+    let mut env = Env::default();
     build.inline(&program.derivatives, &mut env);
     let mut flow = build.real(0.0);
     for k in 0..n {

@@ -7,19 +7,19 @@ use crate::frontend::source::Files;
 use crate::frontend::system::*;
 use crate::frontend::units::Types;
 use crate::functions::{Domain, Unary};
+use crate::hash::HashSet;
 use crate::interval::planted;
 use crate::ranges::reach::{Reach, whole};
 use abi::unit::{Dimension, Unit};
 use grammar::ast::BinaryOp;
 use grammar::diagnostic::Diagnostic;
 use grammar::span::Span;
-use std::collections::HashSet;
 
 /// Reports what cannot be proven safe, and equality comparisons that hardly ever hold.
 pub fn check(system: &System, types: &Types, files: &Files, diagnostics: &mut Vec<Diagnostic>) {
     equalities(system, types, files, diagnostics);
     let mut reach = Reach::new(system);
-    let mut visit = Visit { seen: vec![HashSet::new()], constants: false };
+    let mut visit = Visit { seen: vec![HashSet::default()], constants: false };
     for root in roots(system) {
         visit.walk(&mut reach, root, types, files, diagnostics);
     }
@@ -29,7 +29,7 @@ pub fn check(system: &System, types: &Types, files: &Files, diagnostics: &mut Ve
 /// Checks only constants, since a value that depends on time may stay within its domain during the run.
 pub fn check_given(system: &System, types: &Types, files: &Files, run: Span, diagnostics: &mut Vec<Diagnostic>) {
     let mut reach = Reach::new(system);
-    let mut visit = Visit { seen: vec![HashSet::new()], constants: true };
+    let mut visit = Visit { seen: vec![HashSet::default()], constants: true };
     let written = |id: ExprId| {
         let span = system.span(id);
         span.file == run.file && run.start <= span.start && span.end <= run.end
@@ -145,7 +145,7 @@ impl Visit {
                 for (holds, value) in [(true, *a), (false, *b)] {
                     // A branch that is never taken is not checked.
                     if decided != Some(!holds) {
-                        self.seen.push(HashSet::new());
+                        self.seen.push(HashSet::default());
                         reach.assuming(*c, holds, |reach| self.walk(reach, value, types, files, found));
                         self.seen.pop();
                     }

@@ -269,7 +269,7 @@ fn right_side(system: &System, files: &Files, left: grammar::span::Span, value: 
 
 fn mentioned(system: &System, id: ExprId) -> Vec<VarId> {
     let mut out = Vec::new();
-    let mut seen = std::collections::HashSet::new();
+    let mut seen = crate::hash::HashSet::default();
     let mut stack = vec![id];
     while let Some(id) = stack.pop() {
         if !seen.insert(id) {
@@ -291,7 +291,7 @@ pub fn states(system: &System, program: &Program) -> Vec<Stepped> {
     let n = layout.states.len as usize;
     let slots: Vec<Slot> = (0..n).map(|k| layout.states.slot(k)).collect();
     let build = Shared::new(Build::new("own rates"));
-    let gradients = autodiff::inline(&build, &program.derivatives, &mut Env::new(), &slots);
+    let gradients = autodiff::inline(&build, &program.derivatives, &mut Env::default(), &slots);
     let mut build = build.into_inner();
     let mut own = Vec::new();
     for (k, slot) in slots.iter().enumerate() {
@@ -350,7 +350,7 @@ pub fn states(system: &System, program: &Program) -> Vec<Stepped> {
 
 /// Whether a value depends on the content of a slot other than through the condition of a branch.
 fn depends(build: &Build, value: Value, slot: Slot) -> bool {
-    let mut seen = std::collections::HashSet::new();
+    let mut seen = crate::hash::HashSet::default();
     let mut stack = vec![value];
     while let Some(value) = stack.pop() {
         if !seen.insert(value) {
@@ -394,7 +394,7 @@ fn rate_independent(system: &System) -> Option<bool> {
     if states == 0 {
         return Some(false);
     }
-    let mut seen = std::collections::HashSet::new();
+    let mut seen = crate::hash::HashSet::default();
     while let Some(id) = roots.pop() {
         if !seen.insert(id) {
             continue;

@@ -10,10 +10,11 @@
 //! box at that number. Bounds are rounded outwards. A sum counts as zero if it is negative by no more than 1e-12 of its
 //! terms, because coefficients of equal products may differ in their last digits.
 
+use crate::hash::HashMap;
 use crate::interval::Interval;
 use crate::ir::{Func, Op, Value};
 use abi::Slot;
-use std::collections::{BTreeMap, HashMap};
+use std::collections::BTreeMap;
 use std::rc::Rc;
 
 /// A claim about a function: one of the values `any` is non-negative wherever none of the conditions `unless` holds.
@@ -246,7 +247,7 @@ impl<'a> Bounds<'a> {
             truths[i] = known.or(truth);
             ranges[i] = range;
         }
-        Bounds { func, cell, ranges, truths, sums: vec![None; n], inverse: HashMap::new(), work }
+        Bounds { func, cell, ranges, truths, sums: vec![None; n], inverse: HashMap::default(), work }
     }
 
     fn truth(&self, condition: Value) -> Option<bool> {

@@ -177,8 +177,8 @@ impl Linear {
         let of_ports = inputs.iter().map(|(_, quantity)| quantity).chain(&params).map(|quantity| quantity.slot);
         let directions: Vec<Slot> = layout.states.range().map(|slot| Slot(slot as u32)).chain(of_ports).collect();
         let build = Shared::new(Build::new("linearised").with_pool(description.pool.clone()));
-        let of_rates = autodiff::inline(&build, &program.derivatives, &mut Env::new(), &directions);
-        let of_outputs = autodiff::inline(&build, &program.outputs, &mut Env::new(), &directions);
+        let of_rates = autodiff::inline(&build, &program.derivatives, &mut Env::default(), &directions);
+        let of_outputs = autodiff::inline(&build, &program.outputs, &mut Env::default(), &directions);
         let mut build = build.into_inner();
         let mut next = layout.size();
         let rows = (0..states.len()).map(|i| layout.derivatives.slot(i));

@@ -620,7 +620,7 @@ fn derivative(program: &Program, func: &Func, rows: &[Slot]) -> Func {
     let layout = &program.description.layout;
     let states: Vec<Slot> = layout.states.range().map(|slot| Slot(slot as u32)).collect();
     let build = Shared::new(Build::new("derivative").with_pool(program.description.pool.clone()));
-    let gradients = autodiff::inline(&build, func, &mut Env::new(), &states);
+    let gradients = autodiff::inline(&build, func, &mut Env::default(), &states);
     let mut build = build.into_inner();
     let mut next = layout.size();
     for row in rows {

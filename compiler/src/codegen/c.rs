@@ -5,11 +5,12 @@
 //! products and sums (`-ffp-contract=off`, which `-std=c11` implies with gcc): where the model contracts, `fma` is
 //! explicit. A value that is used once is written inline; a value that is used more often, or stored, gets a name.
 
+use crate::hash::{HashMap, HashSet};
 use crate::ir::{Func, Op, Type, Value, verify};
 use abi::description::Kind;
 use abi::unit::Unit;
 use abi::{Description, Function, Slot};
-use std::collections::{BTreeSet, HashMap, HashSet};
+use std::collections::BTreeSet;
 use std::fmt::Write;
 
 /// Maximum length of an inline expression, in characters.
@@ -100,7 +101,7 @@ fn heading(description: &Description, names: &Names, timeless: bool) -> String {
     out += "#ifdef __FAST_MATH__\n#error \"-ffast-math would change the results\"\n#endif\n";
     out += "#if FLT_EVAL_METHOD != 0\n#error \"doubles must be computed as doubles\"\n#endif\n";
     out += "\n/* Places of the block. */\nenum {\n";
-    let mut notes: HashMap<Slot, String> = HashMap::new();
+    let mut notes: HashMap<Slot, String> = HashMap::default();
     for quantity in &description.quantities {
         let doc = quantity.doc.as_ref().and_then(|doc| doc.lines().next()).unwrap_or_default();
         let unit = if quantity.boolean { "true 1, false 0".into() } else { Unit::si(quantity.unit.dimension).text };
@@ -171,7 +172,7 @@ impl Names {
             }
         }
         // Different paths may have become the same identifier.
-        let mut taken = HashSet::from(["slots".to_string()]);
+        let mut taken = HashSet::from_iter(["slots".to_string()]);
         let name = |(at, wanted): (usize, Option<String>)| {
             let wanted = wanted.unwrap_or_else(|| format!("slot_{at}"));
             let name = if taken.contains(&wanted) { format!("{wanted}_{at}") } else { wanted };
@@ -321,7 +322,7 @@ impl<'a> Writer<'a> {
                 op.each_operand(|operand| uses[operand.index()] += 1);
             }
         }
-        let mut stored = HashMap::new();
+        let mut stored = HashMap::default();
         for (slot, value) in &func.stores {
             stored.entry(*value).or_insert_with(|| names.next(*slot));
         }

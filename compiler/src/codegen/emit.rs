@@ -8,6 +8,7 @@
 //! What the graph leaves open: a loop counts down the number of iterations, with one induction pointer for each stride; a
 //! branch on a compound condition of few tests becomes short-circuit branches; constants are rematerialised at each use.
 
+use crate::hash::{HashMap, HashSet};
 use crate::ir::cfg::{Area, BlockId, Cfg, Count, Entry, Inst, Part, Place, Target, Terminator};
 use crate::ir::{Op, Type, Value, sign_of};
 use cranelift_codegen::ir::condcodes::{FloatCC, IntCC};
@@ -17,7 +18,6 @@ use cranelift_codegen::ir::{
 };
 use cranelift_codegen::isa::TargetIsa;
 use cranelift_frontend::{FunctionBuilder, FunctionBuilderContext};
-use std::collections::{HashMap, HashSet};
 
 /// The signature of [`abi::table::Entry`].
 pub fn signature(isa: &dyn TargetIsa) -> Signature {
@@ -276,7 +276,7 @@ impl<'a> Emitter<'a> {
 
     /// Whether the blocks have few operations, constants included.
     fn is_short(&self, order: &[BlockId]) -> bool {
-        let mut named: HashSet<Value> = HashSet::new();
+        let mut named: HashSet<Value> = HashSet::default();
         for block in order.iter().map(|id| &self.cfg.blocks[id.index()]) {
             block.end.each_value(&mut |value| _ = named.insert(value));
             for inst in &block.insts {
@@ -311,7 +311,7 @@ impl<'a> Emitter<'a> {
 
     /// Emits all blocks, in preorder of the dominator tree: a value is available in the blocks that its own dominates.
     fn subtrees(&mut self, entry: BlockId, order: &[BlockId], b: &mut FunctionBuilder) {
-        let mut children: HashMap<BlockId, Vec<BlockId>> = HashMap::new();
+        let mut children: HashMap<BlockId, Vec<BlockId>> = HashMap::default();
         for (above, id) in self.cfg.dominators(entry).into_iter().zip(0..) {
             if let Some(above) = above {
                 children.entry(above).or_default().push(BlockId(id));

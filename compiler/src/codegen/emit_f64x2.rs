@@ -8,6 +8,7 @@
 use crate::codegen::emit::signature;
 use crate::codegen::loop_plan::{Line, LoopPlan, plan};
 use crate::codegen::unsupported::Unsupported;
+use crate::hash::{HashMap, HashSet};
 use crate::ir::scc::topological_order;
 use crate::ir::{Func, Op, Type, Value, verify};
 use abi::{Layout, Slot};
@@ -15,7 +16,6 @@ use cranelift_codegen::ir::condcodes::{FloatCC, IntCC};
 use cranelift_codegen::ir::{self as clif, AbiParam, BlockArg, InstBuilder, MemFlagsData, types};
 use cranelift_codegen::isa::TargetIsa;
 use cranelift_frontend::{FunctionBuilder, FunctionBuilderContext};
-use std::collections::{HashMap, HashSet};
 
 /// Doubles of a vector.
 pub const LANES: usize = 2;
@@ -55,7 +55,7 @@ pub fn emit(
     b.ins().return_(&[zero]);
 
     let blend = isa.name() == "x64";
-    let values = HashMap::new();
+    let values = HashMap::default();
     let mut line = Emitter {
         step: &step,
         plan,

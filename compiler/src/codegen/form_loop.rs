@@ -11,10 +11,10 @@
 //! Carried slots are parameters of b1 or, if they are many, remain in the block. Source: Lu, Cooper, *Register Promotion
 //! in C Programs*, PLDI 1997.
 
+use crate::hash::{HashMap, HashSet};
 use crate::ir::cfg::{Area, Block, BlockId, Cfg, Count, Entry, Inst, Part, Place, Target, Terminator};
 use crate::ir::{Func, Op, Value};
 use abi::Slot;
-use std::collections::{HashMap, HashSet};
 
 /// Maximum number of slots that a loop carries in registers. More would be spilled anyway, and the time of register
 /// allocation grows with the square of their number.

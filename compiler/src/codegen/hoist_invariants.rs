@@ -5,10 +5,10 @@
 //!
 //! Source: Aho, Lam, Sethi, Ullman, *Compilers*, 2007, sec. 9.5.
 
+use crate::hash::HashSet;
 use crate::ir::cfg::{Area, BlockId, Cfg, Inst, Place};
 use crate::ir::variance::{Slots, Variance, of_ops};
 use abi::Slot;
-use std::collections::HashSet;
 
 /// Hoists the invariants of the loop, if there is one.
 pub fn hoist_invariants(cfg: &mut Cfg) {

@@ -6,13 +6,13 @@
 //!
 //! Source: Aho, Lam, Sethi, Ullman, *Compilers*, 2007, sec. 9.5.
 
+use crate::hash::HashMap;
 use crate::ir::build::{Build, prune};
 use crate::ir::cfg::{BlockId, Cfg, Part};
 use crate::ir::variance::{Variance, variance};
 use crate::ir::verify::types;
 use crate::ir::{Func, Op, Type, Value};
 use abi::{Layout, Slot};
-use std::collections::HashMap;
 
 /// Hoists what depends on parameters alone; the step works on blocks of this layout.
 pub fn hoist_params(cfg: &mut Cfg, layout: &Layout) {

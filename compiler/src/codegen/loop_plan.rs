@@ -12,9 +12,9 @@
 //! block | first area of carried slots | second area | hoisted values | end
 //! ```
 
+use crate::hash::HashSet;
 use crate::ir::variance::{Slots, Variance, propagate};
 use abi::Slot;
-use std::collections::HashSet;
 use std::hash::Hash;
 
 /// A straight line of nodes in topological order.
@@ -80,7 +80,7 @@ pub fn plan<L: Line>(line: &L, size: usize, vectors: usize) -> LoopPlan<L::Node>
     let results: Vec<L::Node> = line.stores().iter().map(|(_, node)| *node).chain(line.status()).collect();
     let last = line.schedule(&results, &variant);
     let read = body.iter().chain(&last).flat_map(|node| line.operands(L::index(*node)));
-    let mut seen = HashSet::new();
+    let mut seen = HashSet::default();
     let hoisted: Vec<L::Node> = read
         .chain(results.iter().copied())
         .chain(line.failed())

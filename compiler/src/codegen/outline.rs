@@ -18,11 +18,12 @@
 use crate::codegen::form_loop::is_idempotent;
 use crate::codegen::reroll::{Repeats, Row, Source, arithmetic_progression, repeats};
 use crate::codegen::side_exit::{cold, tested};
+use crate::hash::{HashMap, HashSet};
 use crate::ir::cfg::{Area, Block, BlockId, Cfg, Count, Entry, Inst, Part, Place, Target, Terminator};
 use crate::ir::variance::{Variance, variance};
 use crate::ir::{Func, Op, Value, Write};
 use abi::Slot;
-use std::collections::{BTreeMap, HashMap, HashSet};
+use std::collections::BTreeMap;
 use std::ops::Range;
 
 /// Limits for outlining; lengths in operations.
@@ -80,7 +81,7 @@ impl<'a> Writer<'a> {
         let mut cfg = Cfg::straight(func, Entry::Several);
         cfg.blocks.clear();
         cfg.scratch_len = outlined.scratch_len;
-        Writer { func, outlined, cfg, known: HashSet::new(), insts: Vec::new() }
+        Writer { func, outlined, cfg, known: HashSet::default(), insts: Vec::new() }
     }
 
     /// Makes a value of another piece available: reads it back from its scratch slot, or loads it again.
@@ -188,7 +189,7 @@ impl<'a> Writer<'a> {
         let at = |area: Area, index: u32, stride: i64| Place { area, index, stride };
         let (mut same, mut inputs): (Vec<Value>, Vec<(Value, Place)>) = (Vec::new(), Vec::new());
         // Constants that differ among the repetitions: the operation, the index of the operand, and the place.
-        let mut constants: HashMap<(Value, usize), Place> = HashMap::new();
+        let mut constants: HashMap<(Value, usize), Place> = HashMap::default();
         for row in &rows {
             let first = row.members[0];
             let mut operands: Vec<Value> = self.func.reads(self.func.op(first)).collect();
@@ -230,7 +231,7 @@ impl<'a> Writer<'a> {
         let read: HashSet<Value> = inputs.iter().map(|(value, _)| *value).collect();
         self.insts.extend(inputs.into_iter().map(|(value, place)| Inst::Reload(value, place)));
         // The operations of the body, where an operand that is a constant of a table gives the operation a new value.
-        let mut renamed: HashMap<Value, Value> = HashMap::new();
+        let mut renamed: HashMap<Value, Value> = HashMap::default();
         for first in rows.iter().map(|row| row.members[0]).filter(|value| !read.contains(value)) {
             let (op, mut n) = (self.func.op(first), 0);
             let op = op.map(|operand| {
@@ -465,7 +466,7 @@ impl<'a> Line<'a> {
     fn store(&self, pieces: &mut [Piece], iteration: &Range<usize>, repeats: &Repeats) {
         let last = iteration.end - 1;
         let mut computed_in: Vec<Option<usize>> = vec![None; self.func.ops.len()];
-        let mut read: HashMap<Slot, usize> = HashMap::new();
+        let mut read: HashMap<Slot, usize> = HashMap::default();
         for (number, piece) in pieces.iter().enumerate().take(iteration.end) {
             for value in piece.values(repeats) {
                 computed_in[value.index()] = Some(number);
@@ -478,7 +479,7 @@ impl<'a> Line<'a> {
         for slot in moved.chain(written).chain(self.tested()).filter_map(|value| self.slot(value)) {
             read.insert(slot, last);
         }
-        let mut slots: HashMap<Value, Vec<Slot>> = HashMap::new();
+        let mut slots: HashMap<Value, Vec<Slot>> = HashMap::default();
         for (slot, value) in &self.func.stores {
             slots.entry(*value).or_default().push(*slot);
         }
@@ -592,9 +593,9 @@ impl<'a> Line<'a> {
         }
         let single: HashSet<Value> = repeats.arrays.iter().flatten().copied().collect();
         let single = |value: &Value| !single.contains(value);
-        let mut scratch_slots = HashMap::new();
+        let mut scratch_slots = HashMap::default();
         // Free slots, by the number of consecutive ones.
-        let mut free: HashMap<usize, Vec<u32>> = HashMap::new();
+        let mut free: HashMap<usize, Vec<u32>> = HashMap::default();
         let mut len = 0;
         let mut ending: Vec<Vec<(usize, u32)>> = vec![Vec::new(); pieces.len() + 1];
         for (number, piece) in pieces.iter().enumerate() {

@@ -9,9 +9,10 @@
 //! elements*, IBM Interdivisional Technical Liaison, 1990; states take the place of array elements.
 
 use crate::codegen::form_loop::MAX_IN_REGISTERS;
+use crate::hash::{HashMap, HashSet};
 use crate::ir::cfg::{BlockId, Cfg, Inst, Terminator};
 use crate::ir::{Func, Op, Type, Value};
-use std::collections::{BTreeSet, HashMap, HashSet};
+use std::collections::BTreeSet;
 
 /// Minimum effort per iteration that carrying `count` values must save: each takes a register.
 fn least_effort(count: usize) -> u32 {
@@ -40,7 +41,7 @@ pub fn predictive_commoning(cfg: &mut Cfg) {
         effects.for_each(|inst| inst.each_value(&mut |value| roots.push(value)));
     }
     let computed: HashSet<Value> = computed(cfg, head);
-    let plain = needed(cfg, roots.clone(), &HashSet::new());
+    let plain = needed(cfg, roots.clone(), &HashSet::default());
     // What is carried needs its next value, which may in turn read a candidate.
     let mut carried: BTreeSet<Value> = BTreeSet::new();
     let live = loop {
@@ -67,7 +68,7 @@ pub fn predictive_commoning(cfg: &mut Cfg) {
     }
 
     // The preheader computes the first ones.
-    let first = needed(cfg, carried.iter().copied().collect(), &HashSet::new());
+    let first = needed(cfg, carried.iter().copied().collect(), &HashSet::default());
     let there: HashSet<Value> = self::computed(cfg, preheader);
     let mut new: Vec<Value> =
         first.into_iter().filter(|value| !cfg.is_free(*value) && !there.contains(value)).collect();
@@ -94,7 +95,7 @@ fn computed(cfg: &Cfg, block: BlockId) -> HashSet<Value> {
 
 /// All values that some values need, themselves included; what `given` values need is left out.
 fn needed(cfg: &Cfg, values: Vec<Value>, given: &HashSet<Value>) -> HashSet<Value> {
-    let mut all: HashSet<Value> = HashSet::new();
+    let mut all: HashSet<Value> = HashSet::default();
     let mut open = values;
     while let Some(value) = open.pop() {
         if all.insert(value) && !given.contains(&value) {
@@ -116,8 +117,8 @@ fn next_values(cfg: &Cfg, head: BlockId, handed: &HashMap<Value, Value>) -> Hash
     };
     let written = block.insts.iter().filter_map(|inst| if let Inst::Write(write) = inst { Some(write) } else { None });
     let written = written.flat_map(|write| [write.index, write.value]);
-    let always = needed(cfg, handed.values().copied().chain(tested).chain(written).collect(), &HashSet::new());
-    let mut known: HashMap<Op, Value> = HashMap::new();
+    let always = needed(cfg, handed.values().copied().chain(tested).chain(written).collect(), &HashSet::default());
+    let mut known: HashMap<Op, Value> = HashMap::default();
     for value in (0..cfg.ops.len() as u32).map(Value).filter(|value| computed.contains(value)) {
         known.entry(cfg.op(value).ordered()).or_insert(value);
     }
@@ -127,7 +128,7 @@ fn next_values(cfg: &Cfg, head: BlockId, handed: &HashMap<Value, Value>) -> Hash
     let reloaded =
         block.insts.iter().filter_map(|inst| if let Inst::Reload(value, _) = inst { Some(*value) } else { None });
     let reloaded: HashSet<Value> = reloaded.collect();
-    let mut found = HashMap::new();
+    let mut found = HashMap::default();
     for (at, op) in cfg.ops.iter().enumerate() {
         let value = Value(at as u32);
         if let Some(becomes) = handed.get(&value) {

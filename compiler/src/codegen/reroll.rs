@@ -8,9 +8,9 @@
 //!
 //! Compare Rocha et al., *Loop Rolling for Code Size Reduction*, CGO 2022, and LLVM's `LoopReroll`.
 
+use crate::hash::HashMap;
 use crate::ir::{Func, Op, Value};
 use abi::Slot;
-use std::collections::HashMap;
 use std::hash::{BuildHasher, BuildHasherDefault, DefaultHasher};
 
 /// Isomorphic operations, one for each repetition.
@@ -146,7 +146,7 @@ impl<'a> Search<'a> {
 
     /// Finds rows: first values of equal shape that results or operations without repetition read, then their operands.
     fn families(&mut self, results: impl Iterator<Item = Value>, min_repetitions: usize) {
-        let mut alike: HashMap<u64, usize> = HashMap::new();
+        let mut alike: HashMap<u64, usize> = HashMap::default();
         for value in &self.values {
             *alike.entry(self.shape[value.index()]).or_default() += 1;
         }
@@ -157,11 +157,11 @@ impl<'a> Search<'a> {
         }
         // Values that are also equal in their constants form a family of their own if they are numerous enough.
         let top: Vec<Value> = self.values.iter().copied().filter(|value| top[value.index()]).collect();
-        let mut equal: HashMap<u64, usize> = HashMap::new();
+        let mut equal: HashMap<u64, usize> = HashMap::default();
         for value in &top {
             *equal.entry(self.exact[value.index()]).or_default() += 1;
         }
-        let mut families: HashMap<(u64, Option<u64>), Vec<Value>> = HashMap::new();
+        let mut families: HashMap<(u64, Option<u64>), Vec<Value>> = HashMap::default();
         for value in top {
             let (shape, exact) = (self.shape[value.index()], self.exact[value.index()]);
             let own = (equal[&exact] >= min_repetitions).then_some(exact);
@@ -260,7 +260,7 @@ impl<'a> Search<'a> {
         let mut of_array = vec![None; self.list.len()];
         // The loop body is emitted with the values of the first repetition, so each of these must have a single source
         // per loop.
-        let mut known: HashMap<(usize, Value), Source> = HashMap::new();
+        let mut known: HashMap<(usize, Value), Source> = HashMap::default();
         for row in order {
             let members = &self.repeats.rows[row].members;
             let count = members.len();

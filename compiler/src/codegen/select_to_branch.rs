@@ -7,13 +7,13 @@
 //!
 //! Source: Warter, Mahlke, Hwu, Rau, *Reverse If-Conversion*, PLDI 1993.
 
+use crate::hash::{HashMap, HashSet};
 use crate::ir::cfg::{Block, BlockId, Cfg, Part, Run, Target, Terminator};
 use crate::ir::{Op, Value};
-use std::collections::{HashMap, HashSet};
 
 /// Turns selects of all blocks into branches.
 pub fn select_to_branch(cfg: &mut Cfg) {
-    let mut straight: HashSet<BlockId> = HashSet::new();
+    let mut straight: HashSet<BlockId> = HashSet::default();
     for piece in &cfg.pieces {
         let order = cfg.order(*piece);
         if cfg.head(&order).is_none() {
@@ -109,7 +109,7 @@ impl BranchRegions {
             cost: u32,
         }
         let mut regions = vec![Region { select: Value(0), within: 0, depth: 0, cost: 0 }];
-        let mut arms: HashMap<Value, [usize; 2]> = HashMap::new();
+        let mut arms: HashMap<Value, [usize; 2]> = HashMap::default();
         // The innermost region that contains all uses of a value seen so far; none: no use yet.
         let mut region_of: HashMap<Value, Option<usize>> = list.iter().map(|value| (*value, None)).collect();
         let common = |regions: &[Region], mut a: usize, mut b: usize| {
@@ -124,7 +124,7 @@ impl BranchRegions {
                 *region = Some(0);
             }
         }
-        let (merged, mut followers) = (merged(&op, list), HashSet::new());
+        let (merged, mut followers) = (merged(&op, list), HashSet::default());
         followers.extend(merged.values().flat_map(|selects| &selects[1..]).copied());
         for value in list.iter().rev() {
             if followers.contains(value) {
@@ -209,7 +209,7 @@ impl BranchRegions {
 
 /// Runs of adjacent selects on the same condition, none of which reads another of its run: by the first of the run.
 fn merged(op: impl Fn(Value) -> Op, list: &[Value]) -> HashMap<Value, Vec<Value>> {
-    let mut merged: HashMap<Value, Vec<Value>> = HashMap::new();
+    let mut merged: HashMap<Value, Vec<Value>> = HashMap::default();
     let mut run: Vec<Value> = Vec::new();
     let mut condition = None;
     for value in list {

@@ -7,9 +7,9 @@
 //! Compare Dynamo's side exits: Bala, Duesterwald, Banerjia, *Dynamo: A Transparent Dynamic Optimization System*, PLDI
 //! 2000; Appel, Reppy 1996 call the rule for what moves partial dead code elimination, as Knoop, Rüthing, Steffen do.
 
+use crate::hash::{HashMap, HashSet};
 use crate::ir::cfg::{Block, BlockId, Cfg, Inst, Part, Target, Terminator};
 use crate::ir::{Func, Op, Type, Value};
-use std::collections::{HashMap, HashSet};
 
 /// The value that is tested after a step, and the value that matters only if that test fails.
 pub fn tested(func: &Func) -> (Option<Value>, Option<Value>) {
@@ -73,7 +73,7 @@ fn split(
         needed.extend(&no.args);
     }
     let (mut kept, mut moved) = (Vec::new(), Vec::new());
-    let mut stored: HashMap<Value, Inst> = HashMap::new();
+    let mut stored: HashMap<Value, Inst> = HashMap::default();
     for inst in std::mem::take(&mut block.insts).into_iter().rev() {
         let is_needed = match &inst {
             Inst::Compute(value) => needed.contains(value) || reads_memory(cfg.op(*value)),
@@ -101,7 +101,7 @@ fn split(
     kept.reverse();
     moved.reverse();
     // What is stored by now is read back, once each.
-    let mut known: HashSet<Value> = HashSet::new();
+    let mut known: HashSet<Value> = HashSet::default();
     let mut insts = Vec::new();
     let detail_uses = [detail].into_iter().filter(|value| !cfg.is_free(*value));
     let read: Vec<Value> = moved.iter().flat_map(|inst| cfg.uses(inst)).chain(detail_uses).collect();

@@ -6,9 +6,9 @@
 //!
 //! Compare LLVM's `Sink` pass; Knoop, Rüthing, Steffen, *Partial Dead Code Elimination*, PLDI 1994.
 
+use crate::hash::HashMap;
 use crate::ir::cfg::{Cfg, Part, Run};
 use crate::ir::{Op, Value};
-use std::collections::HashMap;
 
 /// Sinks cheap operations in all blocks that are not cold.
 pub fn sink(cfg: &mut Cfg) {

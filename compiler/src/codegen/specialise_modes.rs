@@ -17,13 +17,14 @@
 //! 1993.
 
 use crate::codegen::side_exit::{cold, tested};
+use crate::hash::{HashMap, HashSet};
 use crate::ir::build::Build;
 use crate::ir::cfg::{Block, BlockId, Cfg, Inst, Part, Place, Target, Terminator};
 use crate::ir::partial_eval::{known, partial_eval, slice};
 use crate::ir::{Func, Op, Type, Value, number_asked};
 use abi::Slot;
 use std::cmp::Reverse;
-use std::collections::{BTreeMap, HashMap, HashSet};
+use std::collections::BTreeMap;
 
 /// A function with its operations grouped by automaton and mode.
 struct Specialised {
@@ -40,7 +41,7 @@ struct Specialised {
 impl Specialised {
     /// For each value that depends on automata, the index of the last automaton that it needs.
     fn stages(&self) -> HashMap<Value, usize> {
-        let mut stages = HashMap::new();
+        let mut stages = HashMap::default();
         for (k, automaton) in self.automata.iter().enumerate() {
             stages.extend(automaton.outputs.iter().map(|output| (*output, k)));
         }
@@ -162,7 +163,7 @@ type Modes = HashMap<Slot, Vec<u64>>;
 /// Specialises all blocks that hold a step.
 pub fn specialise_modes(cfg: &mut Cfg) {
     // The copies that unswitching makes may no longer compare a slot with all of its modes.
-    let mut modes = Modes::new();
+    let mut modes = Modes::default();
     for (_, slot, bits) in cfg.ops.iter().filter_map(|op| number_asked(*op, |value| cfg.op(value))) {
         let of_slot = modes.entry(slot).or_default();
         if !of_slot.contains(&bits) {
@@ -177,7 +178,7 @@ pub fn specialise_modes(cfg: &mut Cfg) {
             if !specialised.automata.is_empty() {
                 let to = cfg.append(&specialised.func.ops);
                 let to = &to;
-                Writer { cfg, to, specialised: &specialised, at: BlockId(id), stored: HashMap::new() }.step(&cold);
+                Writer { cfg, to, specialised: &specialised, at: BlockId(id), stored: HashMap::default() }.step(&cold);
             }
         }
     }
@@ -410,7 +411,7 @@ fn specialise(func: &Func, modes: &Modes, cold: &[bool], guard: Option<Value>) -
         func.ops[i].each_operand(|operand| used(operand, by, &mut users));
     }
     rematerialise_cheap(func, &mut places);
-    let mut wanted: Vec<HashSet<Value>> = vec![HashSet::new(); slots.len()];
+    let mut wanted: Vec<HashSet<Value>> = vec![HashSet::default(); slots.len()];
     let mut note = |value: Value, by: Group| {
         if let Group::Within(k) = places[value.index()]
             && by != Group::Within(k)
@@ -452,7 +453,7 @@ fn specialise(func: &Func, modes: &Modes, cold: &[bool], guard: Option<Value>) -
 
 /// Of the values for which `wanted` holds, those that automata read, each with the number of automata that read it.
 pub fn shared_operands(func: &Func, wanted: impl Fn(Op) -> bool) -> Vec<(Value, usize)> {
-    let places = dependences(func, &vec![false; func.ops.len()], &automata(func, &Modes::new()));
+    let places = dependences(func, &vec![false; func.ops.len()], &automata(func, &Modes::default()));
     let mut readers: BTreeMap<Value, HashSet<usize>> = BTreeMap::new();
     for (op, place) in func.ops.iter().zip(places) {
         let Group::Within(k) = place else { continue };
@@ -468,7 +469,7 @@ pub fn shared_operands(func: &Func, wanted: impl Fn(Op) -> bool) -> Vec<(Value, 
 /// The automata of a function: loads that are only selected and compared with constants; and their modes: these
 /// constants and those in `known`, as bits.
 fn automata(func: &Func, known: &Modes) -> Vec<(Value, Vec<u64>)> {
-    let mut found: HashMap<Value, Option<Vec<u64>>> = HashMap::new();
+    let mut found: HashMap<Value, Option<Vec<u64>>> = HashMap::default();
     for op in &func.ops {
         if let Some((load, _, bits)) = number_asked(*op, |value| func.op(value)) {
             let modes = found.entry(load).or_insert_with(|| Some(Vec::new()));
@@ -625,7 +626,7 @@ fn split_case(
 
 /// The boolean that most operations of a list read, if more than one does; the first of several.
 fn most_tested(build: &Build, list: &[Value]) -> Option<Value> {
-    let mut counts: HashMap<Value, usize> = HashMap::new();
+    let mut counts: HashMap<Value, usize> = HashMap::default();
     for value in list {
         let op = build.get(*value);
         if matches!(op, Op::Not(_)) {
@@ -664,7 +665,7 @@ mod tests {
         build.store(Slot(3), next);
         build.store(Slot(4), changed);
         let func = build.finish();
-        let specialised = specialise(&func, &Modes::new(), &vec![false; func.ops.len()], None);
+        let specialised = specialise(&func, &Modes::default(), &vec![false; func.ops.len()], None);
         let [automaton] = &specialised.automata[..] else { panic!("one automaton") };
         assert_eq!((automaton.slot, &specialised.joint[..]), (Slot(4), &[][..]));
         let shown = |case: &Case| -> Vec<String> {
@@ -706,7 +707,7 @@ mod tests {
         build.store(Slot(3), next);
         build.store(Slot(4), changed);
         let func = build.finish();
-        let specialised = specialise(&func, &Modes::new(), &vec![false; func.ops.len()], None);
+        let specialised = specialise(&func, &Modes::default(), &vec![false; func.ops.len()], None);
         let CaseEnd::Branch(condition, sides) = &specialised.automata[0].cases[0].1.end else { panic!("it branches") };
         assert!(matches!(specialised.func.op(*condition), Op::Less(..)));
         for side in sides.iter() {

@@ -7,11 +7,11 @@
 //! Source: Allen, Cocke, *A Catalogue of Optimizing Transformations*, 1972, there for loops.
 
 use crate::codegen::specialise_modes::shared_operands;
+use crate::hash::HashSet;
 use crate::ir::build::Build;
 use crate::ir::cfg::{Block, BlockId, Cfg, Inst, Part, Terminator};
 use crate::ir::partial_eval::{known, partial_eval, slice};
 use crate::ir::{Func, Op, Value};
-use std::collections::HashSet;
 
 /// Minimum number of automata that must share a condition for a copy to be worth its size.
 const MIN_AUTOMATA: usize = 3;
@@ -67,7 +67,7 @@ fn assuming(func: &Func, condition: Value, truth: bool) -> Func {
     let mut build = Build::of(func);
     let known = known(&mut build, condition, truth);
     let results: Vec<Value> = func.results().collect();
-    let list = slice(&build, &HashSet::new(), &results);
+    let list = slice(&build, &HashSet::default(), &results);
     let all: Vec<Value> = (0..func.ops.len()).map(|i| Value(i as u32)).collect();
     let values = partial_eval(&mut build, &list, &known, &all);
     build.finish_as(func, &values)

@@ -7,10 +7,11 @@
 use crate::frontend::delays;
 use crate::frontend::source::Files;
 use crate::frontend::system::*;
+use crate::hash::HashMap;
 use crate::ir::scc::components;
 use grammar::diagnostic::Diagnostic;
 use grammar::span::Span;
-use std::collections::{HashMap, VecDeque};
+use std::collections::VecDeque;
 
 /// When an expression is evaluated.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
@@ -131,7 +132,7 @@ fn shortest(graph: &Graph, component: &[VarId]) -> Vec<(VarId, ExprId)> {
     // Breadth-first search from every quantity of a small component, but only from the first 64 of a large one, which
     // bounds the work.
     for &start in component.iter().take(64) {
-        let mut from: HashMap<VarId, (VarId, ExprId)> = HashMap::new();
+        let mut from: HashMap<VarId, (VarId, ExprId)> = HashMap::default();
         let mut queue = VecDeque::from([start]);
         'search: while let Some(v) = queue.pop_front() {
             for &(w, at) in &graph[v.0 as usize] {

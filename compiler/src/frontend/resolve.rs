@@ -4,12 +4,12 @@
 
 use crate::frontend::names::nearest;
 use crate::frontend::source::{Files, SourceFile, Sources, Tree};
+use crate::hash::HashMap;
 use grammar::ast::{self, Item, Name};
 use grammar::diagnostic::Diagnostic;
 use grammar::outline::heads;
 use grammar::span::{FileId, Span};
 use std::cell::RefCell;
-use std::collections::HashMap;
 use std::sync::Arc;
 
 /// The texts of a compilation, with their top-level names resolved.
@@ -238,7 +238,7 @@ pub const RESERVED: [&str; 5] = ["t", "pi", "inf", "true", "false"];
 
 /// Reads `text`, called `name`, and everything it imports.
 pub fn load(name: &str, text: &str, sources: &dyn Sources) -> Loaded {
-    let mut loader = Loader { loaded: Loaded::default(), sources, by_name: HashMap::new(), open: Vec::new() };
+    let mut loader = Loader { loaded: Loaded::default(), sources, by_name: HashMap::default(), open: Vec::new() };
     let root = loader.add(name.to_string(), text, false);
     let mut loaded = loader.loaded;
     if loaded.files.get(root).ast.items().next().is_none() && loaded.diagnostics.is_empty() {

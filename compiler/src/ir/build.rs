@@ -8,9 +8,9 @@
 use super::eval::evaluate;
 use super::verify::{result, types};
 use super::{Binary, Func, Op, Type, Unary, Value, Write};
+use crate::hash::HashMap;
 use abi::Slot;
-use std::collections::{BTreeMap, HashMap};
-use std::hash::{BuildHasherDefault, Hasher};
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 /// The current value of each slot while functions are composed. A slot without an entry still has its initial value.
@@ -22,7 +22,7 @@ pub struct Build {
     name: String,
     ops: Vec<Op>,
     types: Vec<Type>,
-    known: HashMap<Op, Value, BuildHasherDefault<Mix>>,
+    known: HashMap<Op, Value>,
     stores: BTreeMap<Slot, Value>,
     writes: Vec<Write>,
     status: Option<Value>,
@@ -591,37 +591,6 @@ impl Build {
     }
 }
 
-/// A fast hash for operations. The map is only used for lookups, so no result depends on the hash.
-#[derive(Default, Clone)]
-struct Mix(u64);
-
-impl Hasher for Mix {
-    fn finish(&self) -> u64 {
-        // The hash map uses the top bits and the low bits of a hash, so both must be mixed.
-        (self.0 ^ (self.0 >> 32)).wrapping_mul(0x9E37_79B9_7F4A_7C15)
-    }
-
-    fn write(&mut self, bytes: &[u8]) {
-        bytes.iter().for_each(|byte| self.write_u64(u64::from(*byte)));
-    }
-
-    fn write_u8(&mut self, n: u8) {
-        self.write_u64(n.into());
-    }
-
-    fn write_u32(&mut self, n: u32) {
-        self.write_u64(n.into());
-    }
-
-    fn write_u64(&mut self, n: u64) {
-        self.0 = (self.0.rotate_left(23) ^ n).wrapping_mul(0x9E37_79B9_7F4A_7C15);
-    }
-
-    fn write_isize(&mut self, n: isize) {
-        self.write_u64(n as u64);
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -779,7 +748,7 @@ mod tests {
         first.store(Slot(3), doubled);
         let first = first.finish();
         let mut both = Build::new("both");
-        let mut env = Env::new();
+        let mut env = Env::default();
         both.inline(&first, &mut env);
         both.inline(&first, &mut env);
         both.store_env(&env, |_| true);

@@ -9,8 +9,9 @@
 //! Cranelift and MLIR.
 
 use super::{Func, Op, Type, Value, Write, build, reads, verify};
+use crate::hash::{HashMap, HashSet};
 use abi::{Layout, Slot};
-use std::collections::{BTreeSet, HashMap, HashSet};
+use std::collections::BTreeSet;
 
 /// The block with this number; prints as `b3`.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Debug)]
@@ -263,7 +264,7 @@ impl Cfg {
         let block = &self.blocks[block.index()];
         let Terminator::Return(status) = block.end else { return None };
         let mut func = Func { name: self.name.clone(), ops: self.ops.clone(), status, ..Func::default() };
-        let mut computed: HashSet<Value> = HashSet::new();
+        let mut computed: HashSet<Value> = HashSet::default();
         for inst in &block.insts {
             match inst {
                 Inst::Compute(value) => _ = computed.insert(*value),

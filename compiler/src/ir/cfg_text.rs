@@ -19,8 +19,8 @@
 use super::cfg::{Area, Block, BlockId, Cfg, Count, Entry, Inst, Part, Place, Target, Terminator};
 use super::parse::{Line, ParseError, unexpected};
 use super::{Op, Value, Write};
+use crate::hash::{HashMap, HashSet};
 use abi::Slot;
-use std::collections::{HashMap, HashSet};
 use std::fmt;
 
 const ENTRIES: [(Entry, &str); 4] = [
@@ -140,7 +140,7 @@ pub fn parse_cfg(text: &str) -> Result<Cfg, ParseError> {
         return Err(fault(number, format!("expected a name, a comma, one of {all}, and `:`, not `{header}`")));
     };
     let mut cfg = Cfg::new(name, *called);
-    let mut ops: HashMap<Value, (Op, usize)> = HashMap::new();
+    let mut ops: HashMap<Value, (Op, usize)> = HashMap::default();
     let mut last = number;
     for (line, number) in lines {
         last = number;

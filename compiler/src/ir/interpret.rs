@@ -3,6 +3,7 @@
 //! In: functions, a block and a pool of constants. Out: the changed block and the status. Every back end must agree
 //! with it to the bit.
 
+use crate::hash::HashMap;
 use crate::ir::cfg::{Area, BlockId, Cfg, Count, Inst, Place, Terminator};
 use crate::ir::eval::evaluate;
 use crate::ir::verify::{Stage, verify};
@@ -10,7 +11,6 @@ use crate::ir::{Func, Op, Value};
 use abi::table::Interpret;
 use abi::{Function, Layout};
 use std::cell::Cell;
-use std::collections::HashMap;
 
 thread_local! {
     /// Scratch space for the values of a function, kept from call to call.
@@ -152,7 +152,7 @@ struct Graph<'a> {
 impl Graph<'_> {
     fn run(&mut self, entry: BlockId) -> u64 {
         let cfg = self.cfg;
-        let (mut values, mut id): (HashMap<Value, u64>, BlockId) = (HashMap::new(), entry);
+        let (mut values, mut id): (HashMap<Value, u64>, BlockId) = (HashMap::default(), entry);
         // The repetition of the loop, from 0.
         let mut repetition = 0;
         loop {

@@ -5,8 +5,8 @@
 //! [`verify`](super::verify) checks that values exist and types match.
 
 use super::{Binary, Func, Op, Unary, Value, Write};
+use crate::hash::HashMap;
 use abi::{Layout, Slot};
-use std::collections::HashMap;
 use std::fmt;
 use std::str::FromStr;
 use std::sync::LazyLock;

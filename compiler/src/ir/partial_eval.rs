@@ -8,7 +8,7 @@
 
 use super::build::Build;
 use super::{Op, Value};
-use std::collections::{HashMap, HashSet};
+use crate::hash::{HashMap, HashSet};
 
 /// The values that are known if a condition is known to be `truth`, each with its constant: the condition, its parts,
 /// and comparisons that follow from it.
@@ -76,7 +76,7 @@ pub fn partial_eval(build: &mut Build, list: &[Value], known: &[(Value, Value)],
 /// The backward slice of `roots`: the operations that these values need, in order, without constants and without the
 /// values in `available` and what only those need.
 pub fn slice(build: &Build, available: &HashSet<Value>, roots: &[Value]) -> Vec<Value> {
-    let mut list = HashSet::new();
+    let mut list = HashSet::default();
     let mut open = roots.to_vec();
     while let Some(value) = open.pop() {
         let op = build.get(value);
@@ -116,7 +116,7 @@ mod tests {
         let (less, more) = (build.less(x, y), build.less(y, x));
         let other = build.select(more, y, x);
         let chosen = build.select(less, x, other);
-        let list = slice(&build, &HashSet::new(), &[chosen]);
+        let list = slice(&build, &HashSet::default(), &[chosen]);
         assert_eq!(list.len(), 6);
         let true_side = known(&mut build, less, true);
         assert_eq!(partial_eval(&mut build, &list, &true_side, &[chosen, other]), [x, x]);

@@ -9,8 +9,8 @@
 //! levels.
 
 use super::{Func, Op};
+use crate::hash::HashSet;
 use abi::{Layout, Slot};
-use std::collections::HashSet;
 
 /// The most variable quantity that a value depends on. Each level includes those before it.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Debug)]

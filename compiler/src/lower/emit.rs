@@ -4,12 +4,12 @@ use super::{Location, Plan};
 use crate::frontend::causality::{Phase, rate_of, value_of};
 use crate::frontend::delays;
 use crate::frontend::system::*;
+use crate::hash::HashMap;
 use crate::ir::build::Build;
 use crate::ir::{Binary, Type, Unary, Value};
 use crate::numerics::impulse;
 use abi::description::Slot;
 use grammar::ast::BinaryOp;
-use std::collections::HashMap;
 
 /// Emits one function; each node and quantity at most once.
 pub(super) struct Emit<'a> {

@@ -18,13 +18,13 @@ use crate::frontend::causality::Phase;
 use crate::frontend::delays;
 use crate::frontend::system::*;
 use crate::frontend::units::Types;
+use crate::hash::{HashMap, HashSet};
 use crate::ir::Func;
 use crate::ir::program::Program;
 use crate::lower::lookup::Lookup;
 use crate::ranges::reach::Reach;
 use abi::description::{Automaton, Delay, Description, Guard, Kind, Layout, Quantity, Slot, TINY, Tick};
 use abi::unit::Unit;
-use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
 
 /// Location of a quantity's value at run time.
@@ -203,7 +203,7 @@ impl<'a> Plan<'a> {
                 ObservedAt::Output(known.unwrap_or_else(|| added(outputs, Output::Var(id))))
             }
         };
-        let mut shared: HashMap<String, usize> = HashMap::new();
+        let mut shared: HashMap<String, usize> = HashMap::default();
         let mut observed_at: Vec<ObservedAt> = Vec::new();
         for one in wanted {
             observed_at.push(match system.node(one.expr) {

@@ -4,10 +4,10 @@ use super::Plan;
 use super::emit::Emit;
 use crate::frontend::causality::{Phase, rate_of, value_of};
 use crate::frontend::system::*;
+use crate::hash::{HashMap, HashSet};
 use crate::ir::{Func, Unary, Value};
 use abi::description::{Root, Slot};
 use grammar::ast::BinaryOp;
-use std::collections::{HashMap, HashSet};
 
 impl Plan<'_> {
     /// Switching surfaces: functions of the state that change their sign where a branch in the rates or in the observed
@@ -30,8 +30,8 @@ impl Plan<'_> {
         stack.reverse();
         // The flag says that derivatives are continuous there and only have a kink.
         let mut surfaces: Vec<(Value, ExprId, bool)> = Vec::new();
-        let mut known: HashMap<Value, usize> = HashMap::new();
-        let mut moving: HashMap<Value, bool> = HashMap::new();
+        let mut known: HashMap<Value, usize> = HashMap::default();
+        let mut moving: HashMap<Value, bool> = HashMap::default();
         // Observed quantities come last, because their surfaces must not affect the course of a run.
         let mut own = None;
         loop {
@@ -132,7 +132,7 @@ impl Plan<'_> {
 
     /// The comparisons and crossings of which conditions consist.
     fn comparisons(&self, conditions: &[ExprId]) -> HashSet<ExprId> {
-        let mut out = HashSet::new();
+        let mut out = HashSet::default();
         let mut stack = conditions.to_vec();
         while let Some(id) = stack.pop() {
             match self.system.node(id) {

@@ -4,17 +4,17 @@ use super::Plan;
 use super::emit::Emit;
 use crate::frontend::causality::Phase;
 use crate::frontend::system::*;
+use crate::hash::HashMap;
 use crate::ir::build::{Build, Env};
 use crate::ir::{Func, Value};
 use crate::numerics::impulse;
 use abi::description::Slot;
-use std::collections::HashMap;
 
 impl Plan<'_> {
     /// Sets `balanced` to whether a contact stops the mass on which it acts.
     pub(super) fn transitions(&self, mut emit: Emit, balanced: &mut bool) -> Func {
         // For each state: its resets with their conditions, in the order of the text.
-        let mut resets: HashMap<VarId, Vec<(Value, Value)>> = HashMap::new();
+        let mut resets: HashMap<VarId, Vec<(Value, Value)>> = HashMap::default();
         let mut order: Vec<VarId> = Vec::new();
         let mut note = |emit: &mut Emit, fires: Value, list: &[(VarId, ExprId)]| {
             for (var, value) in list {
@@ -84,7 +84,7 @@ impl Plan<'_> {
         }
         let changes = emit.build.finish();
         let memory = self.memory();
-        let (mut all, mut env) = (Build::new("transitions").with_pool(self.description.pool.clone()), Env::new());
+        let (mut all, mut env) = (Build::new("transitions").with_pool(self.description.pool.clone()), Env::default());
         all.inline(&changes, &mut env);
         for (func, slots) in &impulses {
             for (slot, of) in [impulse::ACTS, impulse::TARGET, impulse::PRESENT].into_iter().zip(slots) {

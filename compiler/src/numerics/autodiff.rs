@@ -9,12 +9,12 @@
 //! Source: Griewank, Walther, *Evaluating Derivatives*, 2008, ch. 3 and 7.
 
 use crate::functions::Term;
+use crate::hash::HashMap;
 use crate::ir::build::{Build, Env};
 use crate::ir::expr::{Real, Shared};
 use crate::ir::program::Program;
 use crate::ir::{Func, Op, Value};
 use abi::Slot;
-use std::collections::HashMap;
 
 /// Sparse gradient: the derivatives of a value along the directions it depends on, ascending by direction.
 pub type Gradient = Vec<(u32, Value)>;
@@ -22,7 +22,7 @@ pub type Gradient = Vec<(u32, Value)>;
 /// Inlines `func` on `env` as [`Build::inline`] does, and returns the gradient of each value that it stores. Direction
 /// k is the slot `directions[k]`; all other slots are constant.
 pub fn inline(build: &Shared, func: &Func, env: &mut Env, directions: &[Slot]) -> HashMap<Slot, Gradient> {
-    inline_given(build, func, env, directions, &HashMap::new())
+    inline_given(build, func, env, directions, &HashMap::default())
 }
 
 /// Like [`inline`], but the values of `func` in `given` are replaced and count as constant.
@@ -67,7 +67,7 @@ pub fn inline_given(
             }
         });
     }
-    let mut of_slots = HashMap::new();
+    let mut of_slots = HashMap::default();
     for (slot, value) in &func.stores {
         env.insert(*slot, values[value.index()]);
         of_slots.insert(*slot, gradients[value.index()].clone());
@@ -151,7 +151,7 @@ pub fn jacobian(program: &Program) -> Func {
     let states = (0..n).map(|j| layout.states.slot(j));
     let directions: Vec<Slot> = states.chain([Slot::TIME]).chain(delays.iter().map(|delay| delay.past)).collect();
     let build = Shared::new(Build::new("jacobian"));
-    let of_slots = inline(&build, &program.derivatives, &mut Env::new(), &directions);
+    let of_slots = inline(&build, &program.derivatives, &mut Env::default(), &directions);
     let mut build = build.into_inner();
     let mut next = 0;
     for i in 0..n {

@@ -38,10 +38,10 @@ const ROUNDING: f64 = 1.0 / 1_048_576.0;
 pub fn impulse(speed: &Func, rates: &Func, states: &[Slot], derivatives: &[Slot], pool: &Arc<[f64]>) -> Option<Func> {
     let build = Shared::new(Build::new("impulse").with_pool(pool.clone()));
     let real = |value| Real::new(&build, value);
-    let mut env = Env::new();
+    let mut env = Env::default();
     let slopes = autodiff::inline(&build, speed, &mut env, states).remove(&SPEED)?;
     let v = real(build.borrow_mut().read(SPEED, &env));
-    let mut after = Env::new();
+    let mut after = Env::default();
     let moved = autodiff::inline(&build, rates, &mut after, &[FORCE]);
     let zero = |value| build.borrow().constant(value) == Some(0.0);
     let mut shares = Vec::new();
@@ -114,7 +114,7 @@ mod tests {
         let func = impulse(&speed, &rates, &states, &[Slot(5), Slot(6)], &pool).expect("the force moves both");
         let build = Shared::new(Build::new("both"));
         let number = |x: f64| build.borrow_mut().real(x);
-        let mut env = Env::from([(TARGET, number(0.0)), (ACTS, number(1.0)), (PRESENT, number(0.0))]);
+        let mut env = Env::from_iter([(TARGET, number(0.0)), (ACTS, number(1.0)), (PRESENT, number(0.0))]);
         build.borrow_mut().inline(&func, &mut env);
         let mut build = build.into_inner();
         build.store_env(&env, |slot| slot.0 < 10);

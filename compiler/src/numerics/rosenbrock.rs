@@ -12,6 +12,7 @@
 //! Sources: Steinebach, BIT 63:27, 2023 (method); Hairer, Wanner, *Solving ODEs II*, IV.7 and IV.8 (stages, step
 //! control).
 
+use crate::hash::HashSet;
 use crate::ir::build::{Build, Env};
 use crate::ir::expr::{Int, Real, Shared, Truth};
 use crate::ir::program::Program;
@@ -27,7 +28,6 @@ use abi::rosenbrock::step_control::{
     BEFORE_SURFACE, GREATEST_GAIN, HALFWAY, LEAST_ERROR, LEAST_GAIN, LEAST_ROOT, LEAST_STEP, MOST_BEFORE_SURFACE,
     MOST_OVERRUNS, MOST_REFUSED, NEARLY, ROOT_CONSTANT, SAFETY,
 };
-use std::collections::HashSet;
 use std::sync::OnceLock;
 
 /// A pivot is too small below this fraction of its row. The remaining digits are just enough for an error estimate.

@@ -6,9 +6,10 @@
 //!
 //! Source: Duff, Erisman, Reid, *Direct Methods for Sparse Matrices*, 1986; order of elimination: Markowitz, 1957.
 
+use crate::hash::HashMap;
 use crate::ir::expr::{Real, Truth};
 use crate::numerics::autodiff::Gradient;
-use std::collections::{BTreeMap, HashMap};
+use std::collections::BTreeMap;
 
 /// A sparse square matrix, row by row.
 pub struct Matrix<'a> {
@@ -49,7 +50,7 @@ impl<'a> Matrix<'a> {
         let mut rows = self.rows;
         let n = rows.len();
         let mut remaining: Vec<usize> = (0..n).collect();
-        let mut factors = Factors { order: Vec::new(), rows: Vec::new(), inverse: HashMap::new(), singular: None };
+        let mut factors = Factors { order: Vec::new(), rows: Vec::new(), inverse: HashMap::default(), singular: None };
         while !remaining.is_empty() {
             let in_row =
                 |p: usize, remaining: &[usize]| remaining.iter().filter(|j| rows[p].contains_key(j)).count() - 1;

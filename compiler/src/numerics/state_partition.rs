@@ -5,11 +5,12 @@
 //!
 //! Source: Duff, Erisman, Reid, *Direct Methods for Sparse Matrices*, 1986, ch. 6 (block triangular form).
 
+use crate::hash::HashMap;
 use crate::ir::scc::components;
 use crate::ir::{Func, Op, Value};
 use crate::numerics::switching_conditions::asks;
 use abi::Slot;
-use std::collections::{BTreeMap, HashMap};
+use std::collections::BTreeMap;
 
 /// States that are stepped together.
 #[derive(Clone, PartialEq, Eq, Debug)]

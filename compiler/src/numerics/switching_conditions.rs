@@ -5,10 +5,10 @@
 //!
 //! Source: Hairer, Nørsett, Wanner, *Solving ODEs I*, II.6 (discontinuities and switching functions).
 
+use crate::hash::HashMap;
 use crate::ir::build::{Build, Env, prune};
 use crate::ir::{Func, Op, Value};
 use abi::Slot;
-use std::collections::HashMap;
 
 /// Whether the result of an operation is piecewise constant in its operands: comparisons and roundings.
 pub fn asks(op: Op) -> bool {
@@ -119,7 +119,7 @@ mod tests {
         let build = Shared::new(Build::new("at 3, asked at 0.5 or −2"));
         let number = |x: f64| build.borrow_mut().real(x);
         for (place, expected) in [(0.5, 0.0), (-2.0, -6.0), (2.0, 33.0)] {
-            let at = |x: f64| Env::from([(Slot(3), number(x))]);
+            let at = |x: f64| Env::from_iter([(Slot(3), number(x))]);
             let (there, mut env) = (at(place), at(3.0));
             let answers = asking.answers(&mut build.borrow_mut(), &there);
             let gradients =

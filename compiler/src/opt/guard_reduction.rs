@@ -11,10 +11,10 @@
 //! The method is ours; it is a case of redundant check elimination (Gupta, *Optimizing Array Bound Checks Using Flow
 //! Analysis*, 1993).
 
+use crate::hash::HashSet;
 use crate::ir::build::{Build, prune};
 use crate::ir::partial_eval::{partial_eval, slice};
 use crate::ir::{Func, Op, Value};
-use std::collections::HashSet;
 
 /// Rebuilds a step function so that its finiteness test has as few addends as possible.
 pub fn reduce_guards(func: &Func) -> Func {
@@ -32,7 +32,7 @@ pub fn reduce_guards(func: &Func) -> Func {
 /// Returns the condition `failed` with a smaller sum in its finiteness test: without the addends whose finiteness
 /// follows from another addend. `stored`: values that the step stores; such a value is not split into its own addends.
 pub fn with_fewer_addends(build: &mut Build, failed: Value, stored: &[Value]) -> Value {
-    let list = slice(build, &HashSet::new(), &[failed]);
+    let list = slice(build, &HashSet::default(), &[failed]);
     let finiteness_test = |value: &Value| match build.get(*value) {
         Op::LessEqual(a, b) if a == b => match build.get(a) {
             Op::Sub(a, b) if a == b => Some((*value, a)),
@@ -43,7 +43,7 @@ pub fn with_fewer_addends(build: &mut Build, failed: Value, stored: &[Value]) ->
     // The test is d ≤ d with d = sum − sum: d is 0 for a finite sum, and NaN otherwise.
     let Some((test, sum)) = list.iter().find_map(finiteness_test) else { return failed };
     let (mut addends, mut open) = (Vec::new(), vec![sum]);
-    let (mut seen, stored) = (HashSet::new(), HashSet::<Value>::from_iter(stored.iter().copied()));
+    let (mut seen, stored) = (HashSet::default(), HashSet::<Value>::from_iter(stored.iter().copied()));
     while let Some(value) = open.pop() {
         match build.get(value) {
             Op::Add(a, b) if !stored.contains(&value) => open.extend([b, a]),
@@ -65,7 +65,7 @@ pub fn with_fewer_addends(build: &mut Build, failed: Value, stored: &[Value]) ->
 /// The values that must be finite if all of `by` are: every operand of a sum or product, and the dividend of a
 /// quotient.
 fn implied_finite(build: &Build, by: &[Value]) -> HashSet<Value> {
-    let (mut implied, mut open) = (HashSet::new(), by.to_vec());
+    let (mut implied, mut open) = (HashSet::default(), by.to_vec());
     while let Some(value) = open.pop() {
         let op = build.get(value);
         let mut imply = |operand: Value| {

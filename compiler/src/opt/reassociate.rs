@@ -17,10 +17,10 @@
 //! Sources: Briggs, Cooper, *Effective Partial Redundancy Elimination*, 1994 (reassociation by rank); Parker,
 //! *Combinatorial Merging and Huffman's Algorithm*, 1979 (operands that are ready first are combined first).
 
+use crate::hash::HashSet;
 use crate::ir::build::Build;
 use crate::ir::{Func, Op, Value};
 use abi::Slot;
-use std::collections::HashSet;
 
 /// When a value is ready, in processor cycles after the start of an iteration. `None`: the value is loop-invariant.
 type Ready = Option<i32>;

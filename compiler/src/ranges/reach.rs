@@ -11,11 +11,11 @@
 use crate::frontend::causality::rate_of;
 use crate::frontend::system::*;
 use crate::functions::{self, Binary};
+use crate::hash::HashMap;
 use crate::interval::{Interval, SLACK, planted};
 use abi::description::TINY;
 pub use abi::live::{greatest, least};
 use grammar::ast::BinaryOp;
-use std::collections::HashMap;
 
 /// Upper bound in SI units on the magnitude of parameters, inputs, states and time. Quotients of such numbers do not
 /// underflow to 0.
@@ -65,7 +65,7 @@ impl<'a> Reach<'a> {
             facts: Vec::new(),
             orders: Vec::new(),
             ranges_only: false,
-            known: vec![HashMap::new(), HashMap::new()],
+            known: vec![HashMap::default(), HashMap::default()],
             open: Vec::new(),
             bounding: Vec::new(),
             strict: Vec::new(),
@@ -119,7 +119,7 @@ impl<'a> Reach<'a> {
         self.facts.push((condition, holds));
         let orders = self.order((condition, holds));
         self.orders.push(orders);
-        self.known.push(HashMap::new());
+        self.known.push(HashMap::default());
         let out = then(self);
         self.known.pop();
         self.orders.pop();

@@ -51,7 +51,7 @@ impl StepDerivative {
         let directions: Vec<Slot> = states.iter().chain(inputs).copied().collect();
         let step = crate::numerics::fixed_step::step(program, method);
         let build = Shared::new(Build::new("step derivative").with_pool(program.description.pool.clone()));
-        let gradients = autodiff::inline(&build, &step, &mut Env::new(), &directions);
+        let gradients = autodiff::inline(&build, &step, &mut Env::default(), &directions);
         let mut build = build.into_inner();
         let mut next = layout.size();
         for row in states.iter().chain(outputs) {

@@ -5,7 +5,7 @@
 //!
 //! Source: Intel 64 and IA-32 Architectures Software Developer's Manual, volume 2, sections 2.3 and 2.7.
 
-use std::collections::HashMap;
+use crate::hash::HashMap;
 
 /// Kind of vector.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
@@ -178,7 +178,7 @@ impl Assembler {
             width,
             bytes: Vec::new(),
             constants: Vec::new(),
-            indices: HashMap::new(),
+            indices: HashMap::default(),
             references: Vec::new(),
             rows: Vec::new(),
             row_references: Vec::new(),

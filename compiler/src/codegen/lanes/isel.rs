@@ -9,10 +9,10 @@
 
 use crate::codegen::lanes::assembler::{Instruction, Vectors, instructions as i};
 use crate::codegen::unsupported::Unsupported;
+use crate::hash::HashMap;
 use crate::ir::{Func, Op, Type, Unary, Value, is_not_positive, sign_of, verify};
 use crate::math::{self, exponential, tables};
 use abi::Slot;
-use std::collections::HashMap;
 
 /// Index of a node.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Debug)]
@@ -296,7 +296,7 @@ const SIGN_RESPONSES: u64 = 0xa9a9_a122;
 
 impl Selection {
     fn new(width: Vectors) -> Selection {
-        Selection { width, nodes: Vec::new(), known: HashMap::new() }
+        Selection { width, nodes: Vec::new(), known: HashMap::default() }
     }
 
     fn operations(&mut self, func: &Func, live: &[bool]) -> Result<Vec<Node>, Unsupported> {

@@ -27,12 +27,12 @@ use crate::codegen::lanes::assembler::{Assembler, Base, Vectors, instructions};
 use crate::codegen::lanes::isel::{MachineOp, Node, select};
 use crate::codegen::lanes::regalloc::{Home, RegisterAllocator, place_in};
 use crate::codegen::loop_plan::{LoopPlan, plan};
+use crate::hash::HashMap;
 use crate::ir::verify::{Stage, verify};
 use crate::ir::{Func, Op, Unary};
 use crate::math;
 use abi::Layout;
 use abi::lanes::{Lanes, LanesEntry};
-use std::collections::HashMap;
 use std::sync::Arc;
 
 /// Kind of vector.
@@ -229,7 +229,7 @@ fn generate(
     let vector = width.bytes() as usize;
     let LoopPlan { carried, hoisted, prologue, body: body_order, last: final_order, areas, hoisted_at, end: spills_at } =
         plan(&nodes, layout.size(), vectors * vector);
-    let mut homes: HashMap<Node, Home> = HashMap::new();
+    let mut homes: HashMap<Node, Home> = HashMap::default();
     for (index, node) in nodes.nodes.iter().enumerate() {
         if let MachineOp::Load(slot) = node {
             let home = match carried.iter().position(|(known, _)| known == slot) {

@@ -10,8 +10,8 @@
 
 use crate::codegen::lanes::assembler::{Assembler, Base, Instruction, Place, Vectors, ZEROING, instructions as i};
 use crate::codegen::lanes::isel::{Direction, MachineOp, Node, Nodes, Signs};
+use crate::hash::HashMap;
 use crate::math;
-use std::collections::HashMap;
 use std::ops::Range;
 
 /// The place of a node's vectors in memory: group `index` of vectors after `begin` bytes.
@@ -68,7 +68,7 @@ impl<'a> RegisterAllocator<'a> {
         vectors: usize,
         spills_at: usize,
     ) -> RegisterAllocator<'a> {
-        let mut uses: HashMap<Node, Vec<usize>> = HashMap::new();
+        let mut uses: HashMap<Node, Vec<usize>> = HashMap::default();
         for (at, node) in order.iter().enumerate() {
             for operand in nodes.nodes[node.index()].operands() {
                 uses.entry(operand).or_default().push(at);
@@ -82,8 +82,8 @@ impl<'a> RegisterAllocator<'a> {
             width,
             vectors,
             uses,
-            register: HashMap::new(),
-            spills: HashMap::new(),
+            register: HashMap::default(),
+            spills: HashMap::default(),
             free_spills: Vec::new(),
             freed_by_instruction: Vec::new(),
             spilled: 0,

@@ -12,7 +12,7 @@ impl<'a> Flattener<'a> {
         let env = self.env(id);
         let equations = Env { equation: true, ..env.clone() };
         // Where each quantity is defined, to report second definitions.
-        let mut defined: HashMap<VarId, Span> = HashMap::new();
+        let mut defined: HashMap<VarId, Span> = HashMap::default();
         for declaration in declarations(model) {
             self.define_declaration(id, declaration, &env, &mut defined);
         }
@@ -438,7 +438,7 @@ impl<'a> Flattener<'a> {
                 let span = equation.target.span();
                 let Some((var, wanted)) = self.target(id, &equation.target) else { continue };
                 if let Some(first) = here.iter().find(|other| other.var == var) {
-                    let mut one = HashMap::from([(var, first.span)]);
+                    let mut one = HashMap::from_iter([(var, first.span)]);
                     self.once(var, span, &mut one);
                     continue;
                 }

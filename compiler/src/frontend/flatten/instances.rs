@@ -119,7 +119,7 @@ impl<'a> Flattener<'a> {
                 _ => deeper.push(change),
             }
         }
-        let (names, locals) = (HashMap::new(), Rc::default());
+        let (names, locals) = (HashMap::default(), Rc::default());
         self.instances.push(Tree {
             model,
             file,
@@ -144,7 +144,7 @@ impl<'a> Flattener<'a> {
     /// Declares the quantities and regimes of an instance.
     pub(super) fn declare(&mut self, id: InstanceId) {
         let model = self.tree(id).model;
-        let mut first: HashMap<&'a str, Span> = HashMap::new();
+        let mut first: HashMap<&'a str, Span> = HashMap::default();
         for statement in &model.body {
             match statement {
                 Statement::Declaration(declaration) => self.declaration(id, declaration, &mut first),
@@ -602,7 +602,7 @@ impl<'a> Flattener<'a> {
     pub(super) fn check_arguments(&mut self, id: InstanceId) {
         let tree = self.tree(id);
         let model = tree.model;
-        let mut seen: HashMap<&str, Span> = HashMap::new();
+        let mut seen: HashMap<&str, Span> = HashMap::default();
         let mut errors = Vec::new();
         for arg in &tree.args {
             if let Some(first) = seen.insert(arg.name, arg.span) {

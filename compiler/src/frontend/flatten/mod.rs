@@ -14,11 +14,11 @@ use crate::frontend::names::nearest;
 use crate::frontend::resolve::{ItemRef, Loaded, Lookup, RESERVED, Space, declared_twice, reserved};
 use crate::frontend::source::Sources;
 use crate::frontend::system::*;
+use crate::hash::HashMap;
 use abi::unit::{Angle, Dimension, Unit};
 use grammar::ast::{self, BinaryOp, DeclarationKind, Expr, ExprKind, Item, Name, Statement, Target, UnaryOp};
 use grammar::diagnostic::{Diagnostic, Recurring};
 use grammar::span::{FileId, Span};
-use std::collections::HashMap;
 use std::rc::Rc;
 
 pub use frame::{Frame, Node as BusNode, RigFrame, Scope};
@@ -184,7 +184,7 @@ pub fn flatten_item(loaded: &Loaded, sources: &dyn Sources, file: FileId, item: 
     let observed = match item {
         Item::Function(function) => {
             let mut locals = Vec::new();
-            let mut first: HashMap<&str, Span> = HashMap::new();
+            let mut first: HashMap<&str, Span> = HashMap::default();
             for arg in &function.args {
                 if !f.new_name(&arg.name, &mut first) {
                     continue;
@@ -355,10 +355,10 @@ impl<'a> Flattener<'a> {
             system: System::default(),
             diagnostics: Vec::new(),
             instances: Vec::new(),
-            expansions: HashMap::new(),
+            expansions: HashMap::default(),
             functions: Vec::new(),
-            tables: HashMap::new(),
-            consts: HashMap::new(),
+            tables: HashMap::default(),
+            consts: HashMap::default(),
             open_consts: Vec::new(),
             models: Vec::new(),
             refused: Vec::new(),
@@ -368,7 +368,7 @@ impl<'a> Flattener<'a> {
             too_large: false,
             refused_parts: Vec::new(),
             dropped: Vec::new(),
-            data: HashMap::new(),
+            data: HashMap::default(),
         }
     }
 

@@ -1,9 +1,9 @@
 //! Slopes that are selected among a few values which depend on no state: each gets its own exponential.
 
 use super::Model;
+use crate::hash::HashSet;
 use crate::ir::build::Build;
 use crate::ir::{Op, Value};
-use std::collections::HashSet;
 
 /// Largest number of slopes among which a rate may select for each slope to have its own exponential.
 const MOST_CHOSEN: usize = 4;
@@ -11,7 +11,7 @@ const MOST_CHOSEN: usize = 4;
 impl<'a> Model<'a> {
     /// Whether a value is selected among at most [`MOST_CHOSEN`] values that do not depend on a state.
     pub(super) fn is_chosen(&self, value: Value) -> bool {
-        let (mut open, mut seen, mut given) = (vec![value], HashSet::new(), 0);
+        let (mut open, mut seen, mut given) = (vec![value], HashSet::default(), 0);
         while let Some(value) = open.pop() {
             if !seen.insert(value) {
                 continue;

@@ -3,6 +3,7 @@
 //! Source: Hochbruck, Ostermann, *Exponential integrators*, Acta Numerica 2010.
 
 use super::Model;
+use crate::hash::HashMap;
 use crate::ir::expr::{Real, Truth};
 use crate::ir::{Func, Op, Value};
 use crate::math::phi_functions;
@@ -10,7 +11,7 @@ use crate::numerics::autodiff;
 use crate::numerics::state_partition::Shape;
 use crate::numerics::switching_conditions::SwitchingConditions;
 use abi::Slot;
-use std::collections::{BTreeSet, HashMap};
+use std::collections::BTreeSet;
 
 impl<'a> Model<'a> {
     /// Exponential integrator: exact for a state that relaxes, dx/dt = b − a x. Every other state is linearised in
@@ -33,7 +34,7 @@ impl<'a> Model<'a> {
             let states = &group.states;
             let rates = self.rates_of(states, &stored);
             match group.shape {
-                Shape::Affine => self.affine(&rates, &HashMap::new(), states, &mut next, &mut middle),
+                Shape::Affine => self.affine(&rates, &HashMap::default(), states, &mut next, &mut middle),
                 Shape::PiecewiseAffine => {
                     let own: Vec<Slot> = states.iter().map(|k| layout.states.slot(*k)).collect();
                     let asking = SwitchingConditions::of(&rates, &own);
@@ -64,7 +65,7 @@ impl<'a> Model<'a> {
     /// The results of the switching conditions near the middle of the step.
     fn answers(&self, asking: &SwitchingConditions, states: &[usize], middle: &[Real<'a>]) -> HashMap<Value, Value> {
         let mut mid_step = middle.to_vec();
-        for (k, (f, a)) in states.iter().zip(self.relaxation(&asking.rates, &HashMap::new(), 0.5, middle, states)) {
+        for (k, (f, a)) in states.iter().zip(self.relaxation(&asking.rates, &HashMap::default(), 0.5, middle, states)) {
             mid_step[*k] = self.x[*k] + self.to_middle(a) * f;
         }
         let env = self.env_for(&asking.rates, 0.5, &mid_step);
@@ -144,7 +145,7 @@ impl<'a> Model<'a> {
         for round in 0..4 {
             let (c, at) = if round == 0 { (0.0, &self.x[..]) } else { (0.5, &*middle) };
             let mut moved = Vec::with_capacity(states.len());
-            for (k, (f, a)) in states.iter().zip(self.relaxation(rates, &HashMap::new(), c, at, states)) {
+            for (k, (f, a)) in states.iter().zip(self.relaxation(rates, &HashMap::default(), c, at, states)) {
                 let x = self.x[*k];
                 let r = match a {
                     Some(a) if round > 0 => f + self.falling(a) * (x - middle[*k]),
@@ -186,7 +187,7 @@ impl<'a> Model<'a> {
             if !self.coupling.fades[k] {
                 // For a state that integrates others, the mean of a parabola: from its rate at the start and both end
                 // values.
-                let f = self.relaxation(&self.rates_of(&[k], stored), &HashMap::new(), 0.0, &self.x, &[k])[0].0;
+                let f = self.relaxation(&self.rates_of(&[k], stored), &HashMap::default(), 0.0, &self.x, &[k])[0].0;
                 mean[k] = self.x[k] + (0.5 * h * f + (next[k] - self.x[k] - h * f) / 3.0);
             }
         }

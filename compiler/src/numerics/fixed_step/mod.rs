@@ -10,6 +10,7 @@
 mod choices;
 mod expo;
 
+use crate::hash::HashSet;
 use crate::ir::build::{Build, Env};
 use crate::ir::expr::{Int, Real, Shared, Truth};
 use crate::ir::program::Program;
@@ -21,7 +22,6 @@ use abi::Slot;
 use abi::description::{Guard, Segment};
 use abi::plan::Method;
 use std::cell::RefCell;
-use std::collections::HashSet;
 
 /// One fixed step by `method`. Its length is in [`Slot::STEP`].
 ///
@@ -33,7 +33,7 @@ pub fn step(program: &Program, method: Method) -> Func {
     let model = Model::new(program, &build);
     let next = model.next(method);
 
-    let mut env = Env::new();
+    let mut env = Env::default();
     for (k, x) in next.into_iter().enumerate() {
         // States that have decayed are set to 0, because subnormal numbers slow the processor down.
         let flushed = if model.coupling.fades[k] { x.abs().below(1e-30).choose(0.0, x) } else { x };
@@ -114,7 +114,7 @@ fn watch(build: &Shared, guards: &[Guard], env: &Env) -> Option<Value> {
     let mut total: Option<Real> = None;
     let mut outside: Option<Truth> = None;
     // A state that is also an output has two guards, but enters the sum once.
-    let mut summed: HashSet<Value> = HashSet::new();
+    let mut summed: HashSet<Value> = HashSet::default();
     let number = |n: i64| build.borrow_mut().int(n);
     let mut first = number(0);
     for (group, guards) in guards.chunks(TOGETHER).enumerate().rev() {
