@@ -7,7 +7,8 @@
 //! derivatives where that does not fit; `lanes` the widest vectors of this processor. The row `nothing` leaves out
 //! nothing: its distance from 1 is what the measurement cannot resolve. The last column is the largest gain of the five
 //! beyond that of `nothing`, in percent for each hundred lines of the pass.
-//! `FRIC_PASSES=sink,contract` takes only these; the compiler itself reads no such variable.
+//! `FRIC_PASSES=sink,contract` takes only these, and `FRIC_EACH=1` prints each system; the compiler itself reads no such
+//! variable.
 
 mod clock;
 #[path = "../src/project.rs"]
@@ -58,14 +59,16 @@ fn main() {
             for model in loaded.models() {
                 let Some([fixed, adaptive]) = programs(&name, &text, &model.name.text) else { continue };
                 models += 1;
-                measure(&names, &mut ratios, [false, true, true, true, true], |off| {
+                measure(&model.name.text, &names, &mut ratios, [false, true, true, true, true], |off| {
                     Variant::new(&fixed, &adaptive, off)
                 });
             }
             for experiment in loaded.experiments() {
                 let Some(fixed) = program(&name, &text, &experiment.name, Method::Expo) else { continue };
                 systems += 1;
-                measure(&names, &mut ratios, [true, false, false, false, false], |off| Variant::of_loop(&fixed, off));
+                measure(&experiment.name, &names, &mut ratios, [true, false, false, false, false], |off| {
+                    Variant::of_loop(&fixed, off)
+                });
             }
         }
     }
@@ -87,7 +90,13 @@ fn main() {
 }
 
 /// Adds the ratios of one system to those of each pass. `wanted` are the columns to measure.
-fn measure(names: &[&str], ratios: &mut [[Vec<f64>; 5]], wanted: [bool; 5], variant: impl Fn(Option<&str>) -> Variant) {
+fn measure(
+    system: &str,
+    names: &[&str],
+    ratios: &mut [[Vec<f64>; 5]],
+    wanted: [bool; 5],
+    variant: impl Fn(Option<&str>) -> Variant,
+) {
     let offs = [None].into_iter().chain(names.iter().map(|name| (*name != NOTHING).then_some(*name)));
     let mut variants: Vec<Variant> = offs.map(variant).collect();
     let mut fastest = vec![[f64::INFINITY; 5]; variants.len()];
@@ -98,7 +107,12 @@ fn measure(names: &[&str], ratios: &mut [[Vec<f64>; 5]], wanted: [bool; 5], vari
         }
     }
     let (all, without) = fastest.split_first().expect("there is one");
-    for (ratios, without) in ratios.iter_mut().zip(without) {
+    for ((name, ratios), without) in names.iter().zip(ratios).zip(without) {
+        if std::env::var("FRIC_EACH").is_ok() {
+            let each: Vec<String> =
+                without.iter().zip(all).map(|(without, all)| format!("{:.3}", without / all)).collect();
+            println!("{system}: {name} {}", each.join(" "));
+        }
         for ((ratios, without), all) in ratios.iter_mut().zip(without).zip(all) {
             if without.is_finite() && *all > 0.0 {
                 #[allow(clippy::disallowed_methods, reason = "for people only")]

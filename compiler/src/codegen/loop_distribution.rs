@@ -15,11 +15,11 @@
 //!
 //! Source: Kennedy, Allen, *Optimizing Compilers for Modern Architectures*, 2001, ch. 5.
 
+use crate::hash::HashSet;
 use crate::ir::cfg::{BlockId, Cfg, Leading};
 use crate::ir::variance::{Variance, variance};
 use crate::ir::{Func, Op, Type, Value, verify};
 use abi::{Layout, Slot};
-use std::collections::HashSet;
 
 /// Distributes a step that works on blocks of this layout, if that pays.
 pub fn loop_distribution(cfg: &mut Cfg, layout: &Layout) {
@@ -130,14 +130,19 @@ fn advances_time(func: &Func) -> bool {
 fn passed(func: &Func, on: &[Variance], types: &[Type]) -> Vec<Value> {
     let loaded: HashSet<Slot> = func.loads().into_iter().collect();
     let carried = |slot: &Slot| loaded.contains(slot) && ![Slot::TIME, Slot::COUNT].contains(slot);
-    let states = func.stores.iter().filter(|(slot, _)| carried(slot)).map(|(_, value)| *value);
+    let states: Vec<Value> = func.stores.iter().filter(|(slot, _)| carried(slot)).map(|(_, value)| *value).collect();
+    // Steps that hand nothing to the next one already overlap in the processor, and a step of one instant computes only
+    // one arm of a select.
+    if states.is_empty() && func.writes.is_empty() {
+        return Vec::new();
+    }
     let written = func.writes.iter().flat_map(|write| [write.index, write.value]);
     let guard = func.status.map(|status| match func.op(status) {
         Op::Select(when, _, zero) if func.op(zero) == Op::Int(0) => when,
         _ => status,
     });
     let mut needed = vec![false; func.ops.len()];
-    states.chain(written).chain(guard).for_each(|value| needed[value.index()] = true);
+    states.into_iter().chain(written).chain(guard).for_each(|value| needed[value.index()] = true);
     let mut passed = Vec::new();
     for i in (0..func.ops.len()).rev() {
         let op = func.ops[i];
