@@ -11,7 +11,7 @@ pub use compiler::analysis::explain::{Explanation, QuantityInfo, StepCost};
 pub use compiler::analysis::linearise::{Linear, Matrices, Ports};
 pub use compiler::analysis::step_stability::largest_stable;
 pub use compiler::analysis::step_stability_report::stable_up_to;
-pub use compiler::codegen::elementary::Alone;
+pub use compiler::codegen::elementary::ElementaryFunction;
 use compiler::codegen::lanes;
 use compiler::codegen::target::{self, FunctionCompiler};
 use compiler::codegen::unsupported::Unsupported;
@@ -26,7 +26,7 @@ pub use compiler::frontend::system::LINTS;
 use compiler::opt::reassociate;
 pub use compiler::rig::{StepDerivative, bus_load, dbc_messages, linear as linear_of};
 pub use compiler::{
-    Built, Case, Changes, Loaded, Options, Ready, SourceFile, Sources, build, check, check_declarations, compile,
+    Built, Case, Changes, CompiledRig, Loaded, Options, SourceFile, Sources, build, check, check_declarations, compile,
     dissipation, explain, explain_in, explain_rig, explain_run, fit, linear, load, quantities, rig, stepping, varying,
 };
 use grammar::diagnostic::Diagnostic;
@@ -250,7 +250,7 @@ impl Stopwatch {
 /// A rig compiled for a processor: its programs, as sections of a package.
 pub struct PackedRig {
     /// The same rig in this process, interpreted.
-    pub ready: Ready,
+    pub ready: CompiledRig,
     /// The system without the part that hardware replaces: an [`abi::image::Image`].
     pub control: Vec<u8>,
     /// The replaced part alone, also an image.

@@ -3,11 +3,11 @@
 //! In: a compiled rig. Out: each drive whose torque depends on the speed of the shaft, with the control loop around it,
 //! analysed by runtime::coupling::loop_stability. Knows neither terminal nor files.
 
-use crate::compile::{self, Ready, StepDerivative};
+use crate::compile::{self, CompiledRig, StepDerivative};
 use crate::quantity::significant;
 use abi::Slot;
 use abi::rig::{Kind, Mode, Signal, SignalKind};
-use runtime::coupling::loop_stability::{Ahead, CommandDelay, Loop, Shaft, Step};
+use runtime::coupling::loop_stability::{CommandDelay, Loop, PredictedLoop, Shaft, Step};
 use runtime::coupling::predictor::Wired;
 
 /// The emulated contact of one drive.
@@ -45,7 +45,7 @@ impl Standing {
 }
 
 /// The drives whose torque depends on the speed of the shaft.
-pub fn contacts(ready: &Ready) -> Vec<Contact> {
+pub fn contacts(ready: &CompiledRig) -> Vec<Contact> {
     let rig = &ready.rig;
     let looks = Wired::of(rig, &ready.plant, |_| 0).ok().flatten();
     let told =
@@ -91,7 +91,7 @@ pub fn contacts(ready: &Ready) -> Vec<Contact> {
 
 impl Contact {
     /// The loop with these parameters, linearised at a constant speed after transients have decayed.
-    pub fn at(&self, ready: &Ready, params: &[(Slot, f64)], speed: f64) -> Loop {
+    pub fn at(&self, ready: &CompiledRig, params: &[(Slot, f64)], speed: f64) -> Loop {
         let rig = &ready.rig;
         let period = rig.period_ns as f64 * 1e-9;
         let mut control = ready.control.clone();
@@ -122,13 +122,13 @@ impl Contact {
     }
 
     /// The loop with the predictor, as the rig runs it; none if there is no predictor for this drive.
-    pub fn looking(&self, plain: Loop) -> Option<Ahead> {
+    pub fn looking(&self, plain: Loop) -> Option<PredictedLoop> {
         let ((inertia, sign), position) = (self.told?, self.position.clone()?);
-        Some(Ahead { plain, position, ahead: self.own.clone(), inertia, sign, told: self.late })
+        Some(PredictedLoop { plain, position, ahead: self.own.clone(), inertia, sign, told: self.late })
     }
 
     /// Its stability at rest.
-    pub fn standing(&self, ready: &Ready) -> Standing {
+    pub fn standing(&self, ready: &CompiledRig) -> Standing {
         let near = self.at(ready, &[], 0.0);
         Standing { plain: near.radius(), ahead: self.looking(near).map(|ahead| ahead.radius()) }
     }
@@ -147,7 +147,7 @@ impl Contact {
 }
 
 /// The reasons why a rig must not move, in words; and whether it is stable only with the predictor.
-pub fn objections(ready: &Ready) -> (Vec<String>, bool) {
+pub fn objections(ready: &CompiledRig) -> (Vec<String>, bool) {
     let period = ready.rig.period_ns as f64 * 1e-9;
     let (mut found, mut needs_look) = (Vec::new(), false);
     for contact in contacts(ready) {

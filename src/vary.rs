@@ -4,7 +4,7 @@
 //! a function of its number alone. Random numbers come from a counter-based generator, so a run has the same ones on
 //! every machine and in any order.
 
-use crate::compile::{Alone, spaced};
+use crate::compile::{ElementaryFunction, spaced};
 use crate::quantity;
 use abi::unit::Unit;
 
@@ -155,14 +155,14 @@ impl Vary {
 /// A counter-based random generator.
 pub struct Dice {
     seed: u64,
-    exp: Alone,
-    log: Alone,
+    exp: ElementaryFunction,
+    log: ElementaryFunction,
 }
 
 impl Dice {
     /// Everything drawn depends on the seed alone.
     pub fn new(seed: u64) -> Dice {
-        Dice { seed, exp: Alone::exp(), log: Alone::log() }
+        Dice { seed, exp: ElementaryFunction::exp(), log: ElementaryFunction::log() }
     }
 
     /// The value in SI of a distribution in this draw; `k`: number of the distribution.

@@ -8,7 +8,7 @@ mod heap;
 mod support;
 
 use abi::rig::{Kind, Rig, Signal, SignalKind};
-use compiler::{Changes, Options, Ready};
+use compiler::{Changes, CompiledRig, Options};
 use heap::asked;
 use runtime::hil::cycle::{End, Hil, Options as HilOptions};
 use runtime::hil::simulated::{Pace, World};
@@ -20,17 +20,17 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 use support::{Texts, root};
 
 /// The example, changed by settings such as `fr = rotary Karnopp()`.
-fn ready(set: &[&str]) -> Ready {
+fn ready(set: &[&str]) -> CompiledRig {
     rig_of("rtfs.fric", "rtfs", set)
 }
 
 /// A rig from a text beside the example.
-fn rig_of(file: &str, rig: &str, set: &[&str]) -> Ready {
+fn rig_of(file: &str, rig: &str, set: &[&str]) -> CompiledRig {
     rig_in(file, &fs::read_to_string(root().join("examples/rtfs").join(file)).unwrap(), rig, set)
 }
 
 /// A rig from this text, as if it were stored there.
-fn rig_in(file: &str, text: &str, rig: &str, set: &[&str]) -> Ready {
+fn rig_in(file: &str, text: &str, rig: &str, set: &[&str]) -> CompiledRig {
     let dbc = fs::read_to_string(root().join("examples/rtfs/shaft.dbc")).unwrap();
     let sources = Texts(vec![("shaft.dbc".into(), dbc)]);
     let mut loaded = compiler::load(file, text, &sources);
@@ -40,8 +40,8 @@ fn rig_in(file: &str, text: &str, rig: &str, set: &[&str]) -> Ready {
     made.unwrap_or_else(|errors| panic!("{errors:?}"))
 }
 
-fn started(ready: Ready, seconds: f64) -> (Hil, World, Rig) {
-    let Ready { rig, control, plant, .. } = ready;
+fn started(ready: CompiledRig, seconds: f64) -> (Hil, World, Rig) {
+    let CompiledRig { rig, control, plant, .. } = ready;
     let look = runtime::hil::cycle::look_ahead(&rig, &plant).unwrap();
     let mut world = World::new(&rig, Some(plant), Pace::Fast, 1).unwrap();
     let duration_ns = Some((seconds * 1e9) as u64);
@@ -90,7 +90,7 @@ fn another_model_is_put_on_the_shaft() {
 }
 
 /// The recorded signals of a rig and its readings, one row per cycle, while the model runs.
-fn recorded(ready: Ready, seconds: f64, signals: &[Signal]) -> Vec<(Vec<f64>, Vec<f64>)> {
+fn recorded(ready: CompiledRig, seconds: f64, signals: &[Signal]) -> Vec<(Vec<f64>, Vec<f64>)> {
     let mut world = World::new(&ready.rig, Some(ready.plant), Pace::Fast, 1).unwrap();
     let mut options =
         HilOptions { arms_itself: true, duration_ns: Some((seconds * 1e9) as u64), ..HilOptions::default() };
@@ -708,7 +708,7 @@ fn a_long_run_misses_nothing_and_its_memory_stays_as_it_is() {
 
 #[test]
 fn signals_of_the_example_are_named_as_in_its_text() {
-    let Ready { rig, .. } = ready(&[]);
+    let CompiledRig { rig, .. } = ready(&[]);
     let named = |node, what| runtime::hil::words::signal(&rig, Signal { node, what });
     assert_eq!(named(0, SignalKind::Speed), "load.speed");
     assert!(matches!(rig.nodes[2].kind, Kind::Frames(_)));

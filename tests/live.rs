@@ -7,7 +7,7 @@ mod support;
 
 use abi::description::Slot;
 use abi::live::Tunable;
-use compiler::{Changes, NoSources, Options, Ready};
+use compiler::{Changes, CompiledRig, NoSources, Options};
 use runtime::hil::live::{Judge, Objection, TOLD};
 use runtime::rng::Chance;
 
@@ -106,7 +106,7 @@ rig bench {{
     )
 }
 
-fn start(text: &str, set: &[String]) -> Result<Ready, Vec<grammar::diagnostic::Diagnostic>> {
+fn start(text: &str, set: &[String]) -> Result<CompiledRig, Vec<grammar::diagnostic::Diagnostic>> {
     let mut loaded = compiler::load("bench.fric", text, &NoSources);
     let changes = Changes { set: set.to_vec(), ..Changes::default() };
     let options = Options { changes, interpret: true };
@@ -129,7 +129,7 @@ fn assignment(chance: &mut Chance, path: &str, unit: &str) -> String {
 }
 
 /// The two messages about a set, if they differ.
-fn differ(text: &str, ready: &Ready, set: &[String]) -> Result<Outcome, String> {
+fn differ(text: &str, ready: &CompiledRig, set: &[String]) -> Result<Outcome, String> {
     let mut judge = Judge::new(ready.live.clone(), ready.judge.clone(), &ready.control).unwrap();
     let other = start(text, set);
     let codes = |found: &[grammar::diagnostic::Diagnostic]| {
@@ -179,11 +179,11 @@ enum Outcome {
 }
 
 /// A rig with a set of parameters equals the rig that starts with them: its plan, its ranges, each step to the bit.
-fn same_rig(ready: &Ready, set: &[(Slot, f64)], other: &Ready) -> Result<(), String> {
+fn same_rig(ready: &CompiledRig, set: &[(Slot, f64)], other: &CompiledRig) -> Result<(), String> {
     if ready.rig != other.rig {
         return Err("the plans differ".into());
     }
-    let guards = |ready: &Ready| ready.control.description().guards.clone();
+    let guards = |ready: &CompiledRig| ready.control.description().guards.clone();
     if guards(ready) != guards(other) {
         return Err("the ranges that are watched differ".into());
     }

@@ -4,7 +4,7 @@ mod support;
 
 use abi::Slot;
 use abi::rig::{Kind, Mode, Overrun, Signal, SignalKind};
-use compiler::{Options, Ready};
+use compiler::{CompiledRig, Options};
 use std::fs;
 use support::{Texts, root};
 
@@ -15,7 +15,7 @@ fn texts() -> (String, Texts) {
     (read("rtfs.fric"), Texts(vec![("shaft.dbc".into(), read("shaft.dbc"))]))
 }
 
-fn ready(text: &str, sources: &Texts, name: &str) -> Ready {
+fn ready(text: &str, sources: &Texts, name: &str) -> CompiledRig {
     let mut loaded = compiler::load("rig.fric", text, sources);
     assert!(loaded.diagnostics.is_empty(), "{:?}", loaded.diagnostics);
     let mut warnings = Vec::new();
@@ -33,7 +33,7 @@ fn path(instance: &abi::Instance, slot: Slot) -> String {
 #[test]
 fn the_example_becomes_two_programs_and_a_plan() {
     let (text, sources) = texts();
-    let Ready { rig, control, plant, .. } = ready(&text, &sources, "rtfs");
+    let CompiledRig { rig, control, plant, .. } = ready(&text, &sources, "rtfs");
     assert_eq!((rig.period_ns, rig.steps, rig.watchdog_ns, rig.overrun), (1_000_000, 1, 5_000_000, Overrun::Hold(2)));
     assert_eq!((rig.buses[0].address.as_str(), rig.buses[0].bit_rate), ("socketcan:can0", 1_000_000));
     let names: Vec<&str> = rig.nodes.iter().map(|node| node.name.as_str()).collect();

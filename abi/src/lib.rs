@@ -11,7 +11,7 @@ pub mod foreign;
 pub mod description;
 pub mod rosenbrock;
 pub mod lanes;
-pub mod ahead;
+pub mod distributed_step;
 pub mod table;
 pub mod series;
 pub mod instance;

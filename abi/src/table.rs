@@ -1,7 +1,7 @@
 //! The functions of a compiled model, behind one interface for machine code and interpreters.
 
-use crate::ahead::Ahead;
 use crate::description::Slot;
+use crate::distributed_step::DistributedStep;
 use std::any::Any;
 use std::sync::Arc;
 
@@ -120,7 +120,7 @@ pub struct Machine {
     size: usize,
     pool_len: usize,
     /// The step again, as two distributed loops.
-    ahead: Option<Arc<Ahead>>,
+    ahead: Option<Arc<DistributedStep>>,
     /// The step again, as a single step with hoisted values.
     prepared: Option<Prepared>,
     _memory: Arc<dyn Any + Send + Sync>,
@@ -145,7 +145,7 @@ impl Machine {
     ///
     /// # Safety
     /// They must compute the same bits as the existing step, and work on the same block and pool.
-    pub unsafe fn with_ahead(self, ahead: Ahead) -> Machine {
+    pub unsafe fn with_distributed(self, ahead: DistributedStep) -> Machine {
         Machine { ahead: Some(Arc::new(ahead)), ..self }
     }
 
@@ -159,7 +159,7 @@ impl Machine {
     }
 
     /// Whether many steps use distributed loops.
-    pub fn goes_ahead(&self) -> bool {
+    pub fn is_distributed(&self) -> bool {
         self.ahead.is_some()
     }
 

@@ -235,7 +235,7 @@ pub fn linear(
 }
 
 /// A rig, ready to run.
-pub struct Ready {
+pub struct CompiledRig {
     /// The plan of the rig.
     pub rig: abi::rig::Rig,
     /// The control program, with its parameters set but not started.
@@ -265,7 +265,7 @@ pub fn rig(
     name: &str,
     options: &Options,
     warnings: &mut Vec<Diagnostic>,
-) -> Result<Ready, Vec<Diagnostic>> {
+) -> Result<CompiledRig, Vec<Diagnostic>> {
     let lowered = lowered_rig(loaded, sources, name, options, warnings)?;
     let rig::Lowered { rig, control, plant, live, judge } = lowered;
     let make = |program: &ir::program::Program, functions: &[(Function, ir::Func)]| {
@@ -275,7 +275,7 @@ pub fn rig(
     let (control_made, notes) = make(&control, &functions(&control, rig.method));
     let (plant_made, _) = make(&plant, &functions(&plant, Method::Expo));
     let (judge_made, _) = make(&judge, &judging(&judge));
-    Ok(Ready {
+    Ok(CompiledRig {
         rig,
         control: control_made,
         plant: plant_made,

@@ -3,7 +3,7 @@
 use super::prompt::{Rehearsal, prompt};
 use super::{End, chosen_rig, load_from};
 use crate::args::Hil as Args;
-use crate::compile::{self, Options, Ready, Stopwatch};
+use crate::compile::{self, CompiledRig, Options, Stopwatch};
 use crate::source_snapshot::Keeping;
 use crate::terminal::{Style, Terminal};
 use crate::{loop_stability, quantity, report};
@@ -98,7 +98,7 @@ pub fn hil(args: &Args, terminal: &mut Terminal) -> End {
 }
 
 /// Whether the rig is stable only with the predictor; none if it must not run.
-fn bearable(args: &Args, ready: &Ready, terminal: &mut Terminal) -> Option<bool> {
+fn bearable(args: &Args, ready: &CompiledRig, terminal: &mut Terminal) -> Option<bool> {
     let (mut against, needs_look) = loop_stability::objections(ready);
     if args.accept_unstable {
         against.clear();
@@ -120,7 +120,7 @@ fn bearable(args: &Args, ready: &Ready, terminal: &mut Terminal) -> Option<bool>
 }
 
 /// Rejects combinations of options that exclude each other.
-fn usage(args: &Args, ready: &Ready, drives: Drives) -> Result<(), String> {
+fn usage(args: &Args, ready: &CompiledRig, drives: Drives) -> Result<(), String> {
     if drives.is_fast() && args.duration.is_none() && !args.check && !args.identify {
         return Err(session::FAST_WITHOUT_END.into());
     }
@@ -150,7 +150,7 @@ fn daring(args: &Args) -> Option<&'static str> {
     all.into_iter().find(|(given, _)| *given).map(|(_, name)| name)
 }
 
-fn log_settings(args: &Args, name: &str, ready: &Ready, drives: Drives) -> Settings {
+fn log_settings(args: &Args, name: &str, ready: &CompiledRig, drives: Drives) -> Settings {
     let path = args.log.clone().unwrap_or_else(|| PathBuf::from("out").join(format!("{name}.friclog")));
     let sink = if args.no_log {
         let path = PathBuf::from("out").join(format!("{name}.blackbox.friclog"));
@@ -162,7 +162,7 @@ fn log_settings(args: &Args, name: &str, ready: &Ready, drives: Drives) -> Setti
 }
 
 /// Options of the cycle, or a message about what the rig's predictor lacks.
-fn hil_options(args: &Args, ready: &Ready, drives: Drives) -> Result<HilOptions, String> {
+fn hil_options(args: &Args, ready: &CompiledRig, drives: Drives) -> Result<HilOptions, String> {
     let mut options = session::options(&ready.rig, &ready.plant, drives)?;
     options.control.count_overruns = args.count_overruns;
     options.control.energy_stops = args.stop_on_energy;
@@ -183,7 +183,7 @@ fn hil_options(args: &Args, ready: &Ready, drives: Drives) -> Result<HilOptions,
 }
 
 /// Runs torque pulses in place of the model.
-fn identified(args: &Args, mut ready: Ready, drives: Drives, terminal: &mut Terminal) -> End {
+fn identified(args: &Args, mut ready: CompiledRig, drives: Drives, terminal: &mut Terminal) -> End {
     let asked = match Identification::new(&ready.rig) {
         Ok(asked) => asked,
         Err(why) => {
@@ -226,7 +226,7 @@ struct Asked<'a> {
 }
 
 /// Runs with the buses of these drives.
-fn with_buses(args: &Args, ready: Ready, drives: Drives, asked: Asked, terminal: &mut Terminal) -> End {
+fn with_buses(args: &Args, ready: CompiledRig, drives: Drives, asked: Asked, terminal: &mut Terminal) -> End {
     match drives {
         Drives::Simulated(pace) => in_process(args, ready, pace, asked, terminal),
         Drives::Real => on_buses(args, ready, asked, terminal),
@@ -234,7 +234,7 @@ fn with_buses(args: &Args, ready: Ready, drives: Drives, asked: Asked, terminal:
 }
 
 /// Runs with buses, drives and devices in this process.
-fn in_process(args: &Args, ready: Ready, pace: Pace, asked: Asked, terminal: &mut Terminal) -> End {
+fn in_process(args: &Args, ready: CompiledRig, pace: Pace, asked: Asked, terminal: &mut Terminal) -> End {
     let world = World::new(&ready.rig, Some(ready.plant.clone()), pace, args.seed);
     let mut world = match world {
         Ok(world) => world,
@@ -257,7 +257,7 @@ fn in_process(args: &Args, ready: Ready, pace: Pace, asked: Asked, terminal: &mu
 }
 
 /// Runs on the buses of this machine.
-fn on_buses(args: &Args, ready: Ready, asked: Asked, terminal: &mut Terminal) -> End {
+fn on_buses(args: &Args, ready: CompiledRig, asked: Asked, terminal: &mut Terminal) -> End {
     let world = Simulation::real_time();
     match session::buses(&ready.rig, &world) {
         Ok(buses) => run(args, ready, Box::new(world), buses, Drives::Real, asked, terminal),
@@ -271,7 +271,7 @@ fn on_buses(args: &Args, ready: Ready, asked: Asked, terminal: &mut Terminal) ->
 
 fn run(
     args: &Args,
-    ready: Ready,
+    ready: CompiledRig,
     clock: Box<dyn Clock>,
     buses: Vec<Box<dyn Bus>>,
     drives: Drives,

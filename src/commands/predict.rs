@@ -5,7 +5,7 @@
 
 use super::{End, chosen_rig, load};
 use crate::args::Predict as Args;
-use crate::compile::{self, Changes, Loaded, Options, Ready, Stopwatch};
+use crate::compile::{self, Changes, CompiledRig, Loaded, Options, Stopwatch};
 use crate::loop_stability::{Contact, contacts};
 use crate::quantity::significant;
 use crate::report;
@@ -110,7 +110,7 @@ fn run_by(name: &str, args: &Args, loaded: &Loaded) -> Result<String, String> {
 }
 
 /// Stability of one contact at rest, at the Stribeck speed and while sliding, with remedies.
-fn judged(ready: &Ready, contact: &Contact) -> (String, Value, bool) {
+fn judged(ready: &CompiledRig, contact: &Contact) -> (String, Value, bool) {
     let period = ready.rig.period_ns as f64 * 1e-9;
     let tau = 0.5 * period + contact.late.dead + contact.late.lag;
     let ms = |seconds: f64| significant(1e3 * seconds, 3);
@@ -179,7 +179,7 @@ fn judged(ready: &Ready, contact: &Contact) -> (String, Value, bool) {
 const RIGID: f64 = 6.0 * (1.0 - 0.9) / 1e-3;
 
 /// The resonances of the shaft alone.
-fn resonances(ready: &Ready, contact: &Contact) -> (String, Value) {
+fn resonances(ready: &CompiledRig, contact: &Contact) -> (String, Value) {
     let (states, a) = contact.shaft();
     let (mut words, mut out) = (String::new(), Vec::new());
     for mode in modes(states, a).unwrap_or_default().iter().filter(|mode| mode.imaginary > 0.0) {
@@ -200,7 +200,7 @@ fn resonances(ready: &Ready, contact: &Contact) -> (String, Value) {
 
 /// The parameter that sets the contact's stiffness, with its largest stable value; the one that sets its damping, with
 /// the value that allows the most delay.
-fn advised(ready: &Ready, contact: &Contact, tau: f64) -> (String, Value) {
+fn advised(ready: &CompiledRig, contact: &Contact, tau: f64) -> (String, Value) {
     let here = contact.at(ready, &[], 0.0);
     let own = contact.stiffness(&here);
     let damping = |near: &Loop| near.step.d.iter().sum::<f64>().abs();
@@ -271,7 +271,7 @@ fn advised(ready: &Ready, contact: &Contact, tau: f64) -> (String, Value) {
 }
 
 /// Parameters whose unit satisfies a condition, with their values.
-fn params(ready: &Ready, unit: impl Fn(&str) -> bool) -> Vec<(Quantity, f64)> {
+fn params(ready: &CompiledRig, unit: impl Fn(&str) -> bool) -> Vec<(Quantity, f64)> {
     let all = ready.control.description().quantities.iter();
     all.filter(|q| q.kind == QuantityKind::Param && unit(&q.unit.text))
         .map(|q| (q.clone(), ready.control.get(q.slot)))
@@ -279,7 +279,7 @@ fn params(ready: &Ready, unit: impl Fn(&str) -> bool) -> Vec<(Quantity, f64)> {
 }
 
 /// Resolution in presliding in counts, steps of torque, and bus load.
-fn resolution(ready: &Ready) -> (String, Value) {
+fn resolution(ready: &CompiledRig) -> (String, Value) {
     let rig = &ready.rig;
     let (mut words, mut out) = (String::new(), Vec::new());
     let quantities = &ready.control.description().quantities;
@@ -317,7 +317,7 @@ fn resolution(ready: &Ready) -> (String, Value) {
 }
 
 /// The time of a step on this machine, also as a fraction of its period.
-fn step_time(ready: &Ready) -> (String, Value) {
+fn step_time(ready: &CompiledRig) -> (String, Value) {
     let (median, greatest) = watches::step_time(&ready.rig, &ready.control);
     let period = ready.rig.period_ns as f64 * 1e-9;
     let mut words = format!(
@@ -337,7 +337,7 @@ fn step_time(ready: &Ready) -> (String, Value) {
 }
 
 /// Each contact alone compared with the emulated one, in a standard set of motions.
-fn standard(ready: &Ready) -> (String, Value) {
+fn standard(ready: &CompiledRig) -> (String, Value) {
     let (mut words, mut out) = (String::new(), Vec::new());
     for found in standard::standard(&ready.rig, &ready.control, &ready.plant) {
         let Figures { holds, break_away, ripple, loop_area, slips, stick_slip_error, curve_error, node } = found;
@@ -372,7 +372,7 @@ fn standard(ready: &Ready) -> (String, Value) {
 /// The SIL run compared with one whose drives act without delay: the differences of the plotted quantities.
 fn twins(
     loaded: &mut Loaded,
-    ready: &Ready,
+    ready: &CompiledRig,
     experiment: &str,
     set: &[String],
 ) -> Result<(String, Value), Vec<grammar::diagnostic::Diagnostic>> {

@@ -538,7 +538,7 @@ fn loop_distribution_agrees() {
         let pool: Vec<f64> = (0..POOL_LEN).map(|_| random.real()).collect();
         let layout = random::layout();
         let funcs = [(Function::Step, func.clone())];
-        ahead += usize::from(compile(&funcs, &layout, POOL_LEN).unwrap().0.goes_ahead());
+        ahead += usize::from(compile(&funcs, &layout, POOL_LEN).unwrap().0.is_distributed());
         let block = |random: &mut Random| {
             let mut block: Vec<f64> = (0..layout.size()).map(|_| random.real()).collect();
             let whole = [0.0, random.below(1000) as f64, 9007199254740992.0 - random.below(200) as f64, 0.5];

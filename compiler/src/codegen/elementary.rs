@@ -9,40 +9,40 @@ use abi::Slot;
 
 /// A single elementary function.
 #[derive(Clone)]
-pub struct Alone(Func);
+pub struct ElementaryFunction(Func);
 
-impl Alone {
+impl ElementaryFunction {
     /// e^x
-    pub fn exp() -> Alone {
-        Alone::unary(Unary::Exp)
+    pub fn exp() -> ElementaryFunction {
+        ElementaryFunction::unary(Unary::Exp)
     }
 
     /// The natural logarithm.
-    pub fn log() -> Alone {
-        Alone::unary(Unary::Log)
+    pub fn log() -> ElementaryFunction {
+        ElementaryFunction::unary(Unary::Log)
     }
 
     /// A function of one argument.
-    pub fn unary(function: Unary) -> Alone {
-        Alone::of(|build| {
+    pub fn unary(function: Unary) -> ElementaryFunction {
+        ElementaryFunction::of(|build| {
             let x = build.load(Slot(0));
             build.unary(function, x)
         })
     }
 
     /// A function of two arguments.
-    pub fn binary(function: Binary) -> Alone {
-        Alone::of(|build| {
+    pub fn binary(function: Binary) -> ElementaryFunction {
+        ElementaryFunction::of(|build| {
             let (x, y) = (build.load(Slot(0)), build.load(Slot(1)));
             build.binary(function, x, y)
         })
     }
 
-    fn of(make: impl FnOnce(&mut Build) -> Value) -> Alone {
+    fn of(make: impl FnOnce(&mut Build) -> Value) -> ElementaryFunction {
         let mut build = Build::new("alone");
         let y = make(&mut build);
         build.store(Slot(0), y);
-        Alone(crate::math::expand(&build.finish()))
+        ElementaryFunction(crate::math::expand(&build.finish()))
     }
 
     /// Evaluates a function of one argument.

@@ -13,7 +13,7 @@ use crate::codegen::passes;
 use crate::ir::Func;
 use crate::ir::cfg::{Entry as Called, Leading};
 use crate::ir::verify::{Stage, verify};
-use abi::ahead::{Ahead, RestEntry};
+use abi::distributed_step::{DistributedStep, RemainingEntry};
 use abi::table::{Entry, Machine, Prepared};
 use abi::{Function, Layout};
 use cranelift_module::Module;
@@ -75,7 +75,7 @@ pub fn compile_with(
         .find(|(function, func)| *function == Function::Step && func.ops.len() <= options.lengths.max_function);
     let machine = match step.and_then(|(_, step)| distributed(step, layout, pool_len, options)) {
         // SAFETY: it is the same step, distributed over two loops.
-        Some(ahead) => unsafe { machine.with_ahead(ahead) },
+        Some(ahead) => unsafe { machine.with_distributed(ahead) },
         None => machine,
     };
     Ok((machine, stats))
@@ -83,7 +83,7 @@ pub fn compile_with(
 
 /// Compiles a distributed step; none if distribution does not pay or this processor has no lanes. The lanes of the leading
 /// loop are successive instants of time.
-fn distributed(step: &Func, layout: &Layout, pool_len: usize, options: &Options) -> Option<Ahead> {
+fn distributed(step: &Func, layout: &Layout, pool_len: usize, options: &Options) -> Option<DistributedStep> {
     let graph = passes::run(step, Form::Distributed, Called::Several, &Context { layout: Some(layout), options });
     let Leading { invariants, instants, layout: own, loads, .. } = &**graph.leading.as_ref()?;
     let (invariants, instants) = Width::here_all().find_map(|width| {
@@ -96,12 +96,12 @@ fn distributed(step: &Func, layout: &Layout, pool_len: usize, options: &Options)
     })?;
     let bytes = FunctionCompiler::new(here().ok()?).remaining_loop(step, &graph, instants.width()).ok()?;
     let executable = Executable::new(&bytes.code, bytes.alignment as u64).ok()?;
-    // SAFETY: `address` is the start of code with the signature of `RestEntry`.
-    let entry = unsafe { std::mem::transmute::<*const u8, RestEntry>(executable.address()) };
+    // SAFETY: `address` is the start of code with the signature of `RemainingEntry`.
+    let entry = unsafe { std::mem::transmute::<*const u8, RemainingEntry>(executable.address()) };
     // SAFETY: the entry lives as long as its memory; `loop_distribution` keeps every access to block and pool as it was in
     // the step, which is verified, and loads one output of `own` for each value of the leading loop; code without calls
     // does not unwind.
-    unsafe { Ahead::new(invariants, instants, own.clone(), loads.clone(), entry, Arc::new(executable)) }
+    unsafe { DistributedStep::new(invariants, instants, own.clone(), loads.clone(), entry, Arc::new(executable)) }
 }
 
 type Entries = [Option<Entry>; Function::ALL.len()];

@@ -98,7 +98,7 @@ impl<'a> FunctionCompiler<'a> {
         Ok(Some(PreparedBytes { bytes, loop_offset, prepare, len }))
     }
 
-    /// Compiles the remaining loop of a distributed step, with the signature of [`abi::ahead::RestEntry`]. It reads values
+    /// Compiles the remaining loop of a distributed step, with the signature of [`abi::distributed_step::RemainingEntry`]. It reads values
     /// that the leading loop has computed, one for each of `lanes` steps.
     pub fn remaining_loop(&mut self, func: &Func, graph: &Cfg, lanes: usize) -> Result<Bytes, Unsupported> {
         self.entry(func, graph, (BlockId(0), Entry::Several), lanes)

@@ -1,7 +1,7 @@
 //! Expectations: measures over a run, formulas of them, and the unit in which each is shown.
 
 use super::{PlanNumber, Reader, one_line};
-use crate::codegen::elementary::Alone;
+use crate::codegen::elementary::ElementaryFunction;
 use crate::frontend::system::*;
 use crate::ir::Binary;
 use abi::plan::{self, Formula, MeasureKind};
@@ -295,7 +295,7 @@ impl Reader<'_> {
                     BinaryOp::And => Formula::And(a, b),
                     BinaryOp::Or => Formula::Or(a, b),
                     BinaryOp::Power => {
-                        let alone = Alone::binary(Binary::Pow);
+                        let alone = ElementaryFunction::binary(Binary::Pow);
                         let at = Arc::new(move |x: f64, y: f64| alone.of_both(x, y));
                         Formula::Function(plan::Elementary { name: "^", at }, vec![*a, *b])
                     }
@@ -305,7 +305,7 @@ impl Reader<'_> {
             Node::Call(Builtin::Abs, args) => Some(Formula::Abs(Box::new(self.formula(args[0], measures)?))),
             Node::Call(Builtin::Sqrt, args) => Some(Formula::Sqrt(Box::new(self.formula(args[0], measures)?))),
             Node::Call(Builtin::Unary(function), args) => {
-                let alone = Alone::unary(function);
+                let alone = ElementaryFunction::unary(function);
                 let function = plan::Elementary { name: function.name(), at: Arc::new(move |x, _| alone.at(x)) };
                 Some(Formula::Function(function, vec![self.formula(args[0], measures)?]))
             }

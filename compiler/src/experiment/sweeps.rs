@@ -2,7 +2,7 @@
 
 use super::command_line::CommandLine;
 use super::{Change, MOST_VARIANTS, Statements, one_line};
-use crate::codegen::elementary::Alone;
+use crate::codegen::elementary::ElementaryFunction;
 use crate::frontend::flatten::OverrideValue;
 use crate::frontend::resolve::Loaded;
 use crate::ir::Binary;
@@ -80,7 +80,7 @@ fn grid(first: &Expr, last: &Expr, spacing: &Spacing) -> Grid {
 
 /// `count` numbers from `a` to `b`, both included: in equal ratios if `log`, else at equal distances.
 pub fn spaced(count: usize, a: f64, b: f64, log: bool) -> Vec<f64> {
-    let power = log.then(|| Alone::binary(Binary::Pow));
+    let power = log.then(|| ElementaryFunction::binary(Binary::Pow));
     let value = |k: usize| {
         let part = k as f64 / (count.max(2) - 1) as f64;
         match (k, &power) {

@@ -8,10 +8,10 @@
 //! A dead time n T + r is a queue of n + 1 set-points; within one period the oldest one acts for r, the next one for
 //! the rest. Eigenvalues at 1 are free rotations and constants of the program; they are ignored.
 //!
-//! A loop with a predictor ([`Ahead`]) is simulated instead, including the observer, from a small deflection: the rate
+//! A loop with a predictor ([`PredictedLoop`]) is simulated instead, including the observer, from a small deflection: the rate
 //! at which it decays or grows is its radius.
 
-use crate::coupling::predictor::{Lookahead, Torque};
+use crate::coupling::predictor::{ShaftObserver, Torque};
 use nalgebra::DMatrix;
 use std::collections::VecDeque;
 
@@ -252,7 +252,7 @@ const ENOUGH: f64 = 1e9;
 
 /// A loop of one command with a predictor.
 #[derive(Clone, PartialEq, Debug)]
-pub struct Ahead {
+pub struct PredictedLoop {
     /// The loop without the predictor: one command.
     pub plain: Loop,
     /// The observed position, as a row over the states of the shaft.
@@ -267,7 +267,7 @@ pub struct Ahead {
     pub told: CommandDelay,
 }
 
-impl Ahead {
+impl PredictedLoop {
     /// Factor by which a deflection grows in one period, once the fast modes have decayed: below 1 the loop is stable.
     #[allow(clippy::disallowed_methods, reason = "a figure to be shown and compared with 1: decides nothing that runs")]
     pub fn radius(&self) -> f64 {
@@ -275,7 +275,7 @@ impl Ahead {
         let (n, late) = (shaft.states, late[0]);
         let period_ns = (period * 1e9).round() as u64;
         let dead_ns = (self.told.dead * 1e9).round() as u64;
-        let mut look = Lookahead::new(self.inertia, period_ns, 0.0, vec![Torque::new(dead_ns, self.told.lag)]);
+        let mut look = ShaftObserver::new(self.inertia, period_ns, 0.0, vec![Torque::new(dead_ns, self.told.lag)]);
         let whole = (late.dead / period + 1e-9).floor();
         let rest = (late.dead - whole * period).max(0.0);
         let [before, after] = [rest, period - rest].map(|h| self.plain.transition(h));
@@ -412,7 +412,7 @@ mod tests {
         last < 0.5 * early
     }
 
-    fn ahead(plain: Loop, inertia: f64) -> Ahead {
+    fn ahead(plain: Loop, inertia: f64) -> PredictedLoop {
         let late = plain.late[0];
         // The shaft with its angle: x' = v.
         let mut plain = plain;
@@ -424,7 +424,7 @@ mod tests {
             b: vec![1.0 / inertia, 0.0],
             c: vec![1.0, 0.0],
         };
-        Ahead { plain, position: vec![0.0, 1.0], ahead: vec![false], inertia, sign: 1.0, told: late }
+        PredictedLoop { plain, position: vec![0.0, 1.0], ahead: vec![false], inertia, sign: 1.0, told: late }
     }
 
     /// Without prediction the simulation must agree with the eigenvalues.

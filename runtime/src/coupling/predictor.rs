@@ -19,7 +19,7 @@ use abi::rig::{Kind, Rig, Signal, SignalKind};
 /// Short steps of the observer per period, and of the prediction.
 const STEPS: u64 = 32;
 
-/// Observer poles at a period of 1 ms; at other periods the time constant is the same.
+/// ShaftObserver poles at a period of 1 ms; at other periods the time constant is the same.
 const THETA_AT_1_MS: f64 = 0.9;
 
 /// A residual greater than this multiple of its usual size (one count, or its own running mean) indicates a deviation
@@ -45,7 +45,7 @@ impl Torque {
 
 /// State of the observer.
 #[derive(Clone, PartialEq, Debug)]
-pub struct Lookahead {
+pub struct ShaftObserver {
     inertia: f64,
     period_ns: u64,
     theta: f64,
@@ -68,7 +68,7 @@ pub struct Lookahead {
 
 /// Predicted state of the shaft.
 #[derive(Clone, Copy, PartialEq, Debug)]
-pub struct Ahead {
+pub struct Predicted {
     /// rad/s
     pub speed: f64,
     /// rad
@@ -79,7 +79,7 @@ pub struct Ahead {
 #[derive(Clone, PartialEq, Debug)]
 pub struct Wired {
     /// The observer.
-    pub lookahead: Lookahead,
+    pub observer: ShaftObserver,
     /// The position signal that it observes.
     pub position: Signal,
     /// For each of its torques: the index of the rig's output, the sign with which the output accelerates the shaft,
@@ -123,14 +123,14 @@ impl Wired {
             };
             Torque::new(dead, node.lag)
         });
-        let lookahead = Lookahead::new(inertia, rig.period_ns, emulating.count, torques.collect());
+        let observer = ShaftObserver::new(inertia, rig.period_ns, emulating.count, torques.collect());
         let wired = |k: usize| {
             let signal = rig.outputs[k].signal;
             let step = drive(signal.node).map_or(0.0, |drive| 1e-3 * drive.rated_torque);
             (k, sign(rig, plant, signal, node), step)
         };
         let outputs = outputs.into_iter().map(wired).collect();
-        Ok(Some(Wired { lookahead, position: Signal { node, what: SignalKind::Position }, outputs, node }))
+        Ok(Some(Wired { observer, position: Signal { node, what: SignalKind::Position }, outputs, node }))
     }
 
     /// Passes the permitted outputs to the observer, one value per output of the rig, rounded as the drives receive
@@ -139,14 +139,14 @@ impl Wired {
         for (torque, (output, sign, step)) in self.outputs.iter().enumerate() {
             let value = permitted[*output];
             let heard = if *step > 0.0 { (value / step).round() * step } else { value };
-            self.lookahead.sent(torque, sign * heard);
+            self.observer.sent(torque, sign * heard);
         }
     }
 
     /// Resets to a shaft at rest, with these outputs permitted for long.
     pub fn restart(&mut self, permitted: &[f64]) {
-        self.lookahead.restart();
-        for (torque, (output, sign, _)) in self.lookahead.torques.iter_mut().zip(&self.outputs) {
+        self.observer.restart();
+        for (torque, (output, sign, _)) in self.observer.torques.iter_mut().zip(&self.outputs) {
             torque.lag.settle(sign * permitted[*output]);
         }
     }
@@ -168,13 +168,13 @@ pub(crate) fn sign(rig: &Rig, plant: &Instance, torque: Signal, node: usize) -> 
     if turned[1] < turned[0] { -1.0 } else { 1.0 }
 }
 
-impl Lookahead {
+impl ShaftObserver {
     /// An observer of a shaft at rest. `inertia` in kg·m²; `count`: quantisation step of the encoder, rad; `torques`:
     /// the emulating drive first, then all others whose commands are known.
     ///
     /// # Panics
     /// Without a torque, or if inertia or period are not positive.
-    pub fn new(inertia: f64, period_ns: u64, count: f64, torques: Vec<Torque>) -> Lookahead {
+    pub fn new(inertia: f64, period_ns: u64, count: f64, torques: Vec<Torque>) -> ShaftObserver {
         assert!(inertia > 0.0 && period_ns > 0 && !torques.is_empty(), "a shaft of {inertia} kg·m², {period_ns} ns");
         let first = &torques[0];
         let horizon_ns = first.dead_ns + period_ns / 2 + (first.lag.constant() * 1e9).round() as u64;
@@ -182,7 +182,7 @@ impl Lookahead {
         // on every machine.
         let x = period_ns as f64 / 1e6 * ((1.0 - THETA_AT_1_MS) / (0.5 * (1.0 + THETA_AT_1_MS)));
         let theta = ((1.0 - 0.5 * x) / (1.0 + 0.5 * x)).max(0.0);
-        Lookahead {
+        ShaftObserver {
             inertia,
             period_ns,
             theta,
@@ -278,7 +278,7 @@ impl Lookahead {
     }
 
     /// Predicted state of the shaft at the time when the present computation acts.
-    pub fn ahead(&mut self) -> Ahead {
+    pub fn ahead(&mut self) -> Predicted {
         self.ahead.clone_from_slice(&self.torques);
         let (mut speed, mut position) = (self.speed, self.position);
         let s = self.horizon_ns as f64 * 1e-9 / STEPS as f64;
@@ -290,10 +290,10 @@ impl Lookahead {
             position += s * (speed + 0.5 * s * acceleration);
             speed += s * acceleration;
         }
-        Ahead { speed, position }
+        Predicted { speed, position }
     }
 
-    /// Appends the complete state as words, from which [`Lookahead::restore`] continues.
+    /// Appends the complete state as words, from which [`ShaftObserver::restore`] continues.
     pub fn save(&self, words: &mut Vec<u64>) {
         words.extend([self.now_ns, u64::from(self.started), u64::from(self.unusual_for)]);
         let numbers = [self.position, self.speed, self.disturbance, self.residual, self.usual];
@@ -301,7 +301,7 @@ impl Lookahead {
         self.torques.iter().for_each(|torque| torque.lag.save(words));
     }
 
-    /// Restores the state that [`Lookahead::save`] wrote. None if the words do not fit.
+    /// Restores the state that [`ShaftObserver::save`] wrote. None if the words do not fit.
     pub fn restore(&mut self, words: &mut impl Iterator<Item = u64>) -> Option<()> {
         self.now_ns = words.next()?;
         self.started = words.next()? != 0;
@@ -361,7 +361,7 @@ mod tests {
         /// Measured speed as input, force as output.
         Plain,
         /// With the predictor of this module.
-        Ahead {
+        Predicted {
             /// Encoder counts in the presliding range.
             counts: f64,
             /// Whether the predictor knows the pulling force.
@@ -375,11 +375,11 @@ mod tests {
         let (mut x, mut v) = (0.0, 0.0);
         let mut bristle = Bristle { z: 0.0 };
         let count = match coupling {
-            Coupling::Ahead { counts, .. } if counts > 0.0 => 1.5 / SIGMA[0] / counts,
+            Coupling::Predicted { counts, .. } if counts > 0.0 => 1.5 / SIGMA[0] / counts,
             _ => 1e-12,
         };
         let torques = vec![Torque::new(dead_ns, LAG), Torque::new(0, 0.0)];
-        let mut look = Lookahead::new(mass, T_NS, count, torques);
+        let mut look = ShaftObserver::new(mass, T_NS, count, torques);
         let mut drive = Lag::new(LAG);
         let (mut courses, mut slips, mut sticking) = (Vec::new(), 0, true);
         for tick in 0..20_000u64 {
@@ -387,7 +387,7 @@ mod tests {
             let t = tick as f64 * 1e-3;
             if coupling != Coupling::Ideal {
                 let seen = match coupling {
-                    Coupling::Ahead { told, .. } => {
+                    Coupling::Predicted { told, .. } => {
                         look.observe(now, (x / count).floor() * count);
                         if told {
                             look.sent(1, k * (speed * t - x));
@@ -440,8 +440,8 @@ mod tests {
                 (error(&course, &ideal), slips)
             };
             let plain = one(Coupling::Plain);
-            let exact = one(Coupling::Ahead { counts: 0.0, told: true });
-            let full = one(Coupling::Ahead { counts: 15.0, told: false });
+            let exact = one(Coupling::Predicted { counts: 0.0, told: true });
+            let full = one(Coupling::Predicted { counts: 15.0, told: false });
             table += &format!("{dead_us} us: {plain:.1?} {exact:.1?} {full:.1?}\n");
             if dead_us == 2000 {
                 assert!((20.0..30.0).contains(&plain.0), "{table}");
@@ -456,7 +456,7 @@ mod tests {
     #[test]
     fn an_unknown_torque_is_estimated() {
         let (inertia, count) = (0.012, 2.4e-5);
-        let mut look = Lookahead::new(inertia, T_NS, count, vec![Torque::new(800_000, 0.6e-3)]);
+        let mut look = ShaftObserver::new(inertia, T_NS, count, vec![Torque::new(800_000, 0.6e-3)]);
         let (mut x, mut v) = (0.0f64, 0.0);
         for tick in 0..400u64 {
             look.observe(tick * T_NS, (x / count).floor() * count);

@@ -66,8 +66,12 @@ pub(crate) fn run(
     let mut paths = paths(rig);
     let readings = readings(rig, &paths);
     let unable = |why| Stop { cause: Cause::Rig { condition: "predict".into(), why }, time: 0.0 };
-    let mut look =
-        Ahead { wired: Wired::of(rig, &bench.plant, |_| 0).map_err(unable)?, seen: None, speed: None, position: None };
+    let mut look = SilPredictor {
+        wired: Wired::of(rig, &bench.plant, |_| 0).map_err(unable)?,
+        seen: None,
+        speed: None,
+        position: None,
+    };
     if let Some(wired) = &look.wired {
         let slot = |what| rig.plant.seen.iter().find(|(signal, _)| *signal == Signal { node: wired.node, what });
         look.seen = slot(SignalKind::Position).map(|(signal, slot)| (*slot, step_of_signal(rig, *signal)));
@@ -126,7 +130,7 @@ pub(crate) fn run(
 }
 
 /// The predictor, if the rig has `predict`.
-struct Ahead {
+struct SilPredictor {
     wired: Option<Wired>,
     /// Slot of the position in the plant, and the size of one count.
     seen: Option<(Slot, f64)>,
@@ -135,14 +139,14 @@ struct Ahead {
     position: Option<Slot>,
 }
 
-impl Ahead {
+impl SilPredictor {
     fn read(&mut self, now_ns: u64, control: &mut Instance, plant: &Instance) {
         let (Some(wired), Some((slot, count))) = (&mut self.wired, self.seen) else { return };
-        wired.lookahead.observe(now_ns, (plant.get(slot) / count).floor() * count);
-        if !wired.lookahead.is_valid() {
+        wired.observer.observe(now_ns, (plant.get(slot) / count).floor() * count);
+        if !wired.observer.is_valid() {
             return;
         }
-        let ahead = wired.lookahead.ahead();
+        let ahead = wired.observer.ahead();
         for (slot, value) in [(self.speed, ahead.speed), (self.position, ahead.position)] {
             if let Some(slot) = slot {
                 control.set(slot, value);
@@ -153,7 +157,7 @@ impl Ahead {
     fn sent(&mut self, paths: &[Path]) {
         let Some(wired) = &mut self.wired else { return };
         for (torque, (output, sign, step)) in wired.outputs.iter().enumerate() {
-            wired.lookahead.sent(torque, sign * in_steps(paths[*output].permitted, *step));
+            wired.observer.sent(torque, sign * in_steps(paths[*output].permitted, *step));
         }
     }
 }

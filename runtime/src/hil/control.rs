@@ -676,24 +676,24 @@ mod tests {
     const FRESH: u32 = 0;
 
     /// A running rig with one drive: readings of its position, speed and torque.
-    struct Way {
+    struct TestRig {
         control: Control,
         readings: Vec<Reading>,
     }
 
-    impl Way {
-        fn new(change: impl FnOnce(&mut Rig)) -> Way {
-            Way::of(change, Options::default())
+    impl TestRig {
+        fn new(change: impl FnOnce(&mut Rig)) -> TestRig {
+            TestRig::of(change, Options::default())
         }
 
-        fn of(change: impl FnOnce(&mut Rig), options: Options) -> Way {
+        fn of(change: impl FnOnce(&mut Rig), options: Options) -> TestRig {
             let (mut rig, model) = rigs::rig();
             change(&mut rig);
             let options = Options { ramp_ns: 0, blend_ns: 10_000_000, ..options };
             let mut control = Control::new(&rig, model, None, &[], options).unwrap();
             assert!(control.supervisor_mut().arm());
             let readings = control.signals().map(|_| Reading { value: 0.0, age: FRESH }).collect();
-            Way { control, readings }
+            TestRig { control, readings }
         }
 
         fn set(&mut self, what: SignalKind, value: f64) {
@@ -720,7 +720,7 @@ mod tests {
 
     #[test]
     fn the_model_steps_over_the_coming_period_with_the_newest_readings() {
-        let mut way = Way::new(|_| ());
+        let mut way = TestRig::new(|_| ());
         way.set(SignalKind::Speed, 2.0);
         // A spring of 10 N·m/rad on the angle, which is the integral of 2 rad/s after k periods.
         for k in 1..=5 {
@@ -731,14 +731,14 @@ mod tests {
 
     #[test]
     fn missed_ticks_are_compensated_and_too_many_stop_the_rig() {
-        let mut way = Way::new(|rig| rig.overrun = Overrun::Hold(2));
+        let mut way = TestRig::new(|rig| rig.overrun = Overrun::Hold(2));
         way.set(SignalKind::Speed, 2.0);
         way.cycle(1, &[]);
         let torque = way.cycle(3, &[]);
         assert!((torque + 10.0 * 2.0 * 4e-3).abs() < 1e-12, "{torque}");
         way.cycle(4, &[]);
         assert_eq!(way.control.supervisor().cause(), Some(Cause::Overrun(5)));
-        let mut strict = Way::new(|_| ());
+        let mut strict = TestRig::new(|_| ());
         strict.cycle(2, &[]);
         assert_eq!(strict.control.supervisor().cause(), Some(Cause::Overrun(1)));
     }
@@ -747,7 +747,7 @@ mod tests {
     fn repeated_missed_ticks_stop_the_rig_unless_cycles_in_time_compensate() {
         for most in 1..6 {
             let cause = |ticks: &mut dyn FnMut(u32) -> u32| {
-                let mut way = Way::new(|rig| rig.overrun = Overrun::Hold(most));
+                let mut way = TestRig::new(|rig| rig.overrun = Overrun::Hold(most));
                 (0..200).find(|k| {
                     way.cycle(ticks(*k), &[]);
                     way.control.supervisor().cause().is_some()
@@ -763,7 +763,7 @@ mod tests {
     #[test]
     fn an_infinite_reading_is_rejected() {
         for bad in [f64::INFINITY, f64::NEG_INFINITY, f64::NAN] {
-            let mut way = Way::new(|_| ());
+            let mut way = TestRig::new(|_| ());
             way.set(SignalKind::Speed, 1.0);
             way.cycle(1, &[]);
             let at = way.control.signals().position(|signal| signal.what == SignalKind::Torque).unwrap();
@@ -865,7 +865,7 @@ mod tests {
 
     #[test]
     fn a_missing_reading_is_held_and_then_counts_as_lost() {
-        let mut way = Way::new(|_| ());
+        let mut way = TestRig::new(|_| ());
         way.set(SignalKind::Speed, 1.0);
         way.cycle(1, &[]);
         for age in 1..3 {
@@ -880,7 +880,7 @@ mod tests {
 
     #[test]
     fn a_glitch_is_rejected_and_three_in_a_row_stop_the_rig() {
-        let mut way = Way::new(|_| ());
+        let mut way = TestRig::new(|_| ());
         way.set(SignalKind::Speed, 1.0);
         let held = way.cycle(1, &[]);
         for (cycle, cause) in [(1, None), (2, None), (3, Some(()))] {
@@ -948,7 +948,7 @@ mod tests {
 
     #[test]
     fn a_second_of_implausible_readings_is_tolerated_if_overruns_are_only_counted() {
-        let mut way = Way::of(|_| (), Options { count_overruns: true, ..Options::default() });
+        let mut way = TestRig::of(|_| (), Options { count_overruns: true, ..Options::default() });
         way.set(SignalKind::Speed, 1.0);
         way.cycle(1, &[]);
         way.set(SignalKind::Speed, f64::NAN);
@@ -962,7 +962,7 @@ mod tests {
 
     #[test]
     fn a_set_of_parameters_causes_no_step_in_the_output() {
-        let mut way = Way::new(|_| ());
+        let mut way = TestRig::new(|_| ());
         way.set(SignalKind::Speed, 1.0);
         for _ in 0..10 {
             way.cycle(1, &[]);
@@ -983,7 +983,7 @@ mod tests {
 
     #[test]
     fn a_set_with_which_the_model_cannot_continue_is_refused() {
-        let mut way = Way::new(|_| ());
+        let mut way = TestRig::new(|_| ());
         way.set(SignalKind::Speed, 1.0);
         let first = way.cycle(1, &[]);
         let stiffness = way.control.model().description().layout.params.slot(0);
@@ -994,7 +994,7 @@ mod tests {
 
     #[test]
     fn a_failure_of_the_model_stops_the_rig() {
-        let mut way = Way::new(|_| ());
+        let mut way = TestRig::new(|_| ());
         way.set(SignalKind::Speed, 1.0);
         way.cycle(1, &[]);
         let state = way.control.model.description().layout.states.slot(0);
@@ -1017,12 +1017,12 @@ mod tests {
 
     #[test]
     fn what_is_saved_goes_on_as_before() {
-        let mut first = Way::new(|_| ());
+        let mut first = TestRig::new(|_| ());
         for k in 0..50 {
             first.set(SignalKind::Speed, f64::from(k % 5) * 0.1);
             let mut words = Vec::new();
             first.control.save(&mut words);
-            let mut second = Way::new(|_| ());
+            let mut second = TestRig::new(|_| ());
             second.readings.clone_from(&first.readings);
             assert_eq!(second.control.restore(&words), Some(()));
             assert_eq!(first.cycle(1, &[]).to_bits(), second.cycle(1, &[]).to_bits(), "cycle {k}");

@@ -5,7 +5,7 @@
 //! Knows neither clock nor bus, so a replay of the same readings reproduces every bit. Allocates only at construction.
 
 use crate::coupling::passivity::{Energy, Sign};
-use crate::coupling::predictor::{Ahead, Wired};
+use crate::coupling::predictor::{Predicted, Wired};
 use crate::safety::{Protection, is_present};
 use abi::rig::{Kind, Mode, Rig, Signal, SignalKind};
 use abi::{Instance, Slot};
@@ -157,7 +157,7 @@ impl Coupling {
     }
 
     /// One cycle, `ticks` after the last one and begun `late_ns` after its tick. `read`: reading of each signal.
-    pub fn read(&mut self, ticks: u32, late_ns: u32, read: impl Fn(usize) -> Read) -> (Option<Ahead>, Verdict) {
+    pub fn read(&mut self, ticks: u32, late_ns: u32, read: impl Fn(usize) -> Read) -> (Option<Predicted>, Verdict) {
         self.now_ns += u64::from(ticks) * self.period_ns;
         let ahead = self.look(self.now_ns + u64::from(late_ns), read(self.position));
         let lost = self.look.is_some() && ahead.is_none();
@@ -177,8 +177,8 @@ impl Coupling {
         (ahead, verdict)
     }
 
-    fn look(&mut self, now_ns: u64, (position, fresh): Read) -> Option<Ahead> {
-        let look = &mut self.look.as_mut()?.lookahead;
+    fn look(&mut self, now_ns: u64, (position, fresh): Read) -> Option<Predicted> {
+        let look = &mut self.look.as_mut()?.observer;
         match fresh {
             true => look.observe(now_ns, position),
             false => look.coast(now_ns),
@@ -198,7 +198,7 @@ impl Coupling {
     pub fn save(&self, words: &mut Vec<u64>) {
         words.push(self.now_ns);
         if let Some(wired) = &self.look {
-            wired.lookahead.save(words);
+            wired.observer.save(words);
         }
         self.contacts.iter().for_each(|contact| contact.energy.save(words));
     }
@@ -207,7 +207,7 @@ impl Coupling {
     pub fn restore(&mut self, words: &mut impl Iterator<Item = u64>) -> Option<()> {
         self.now_ns = words.next()?;
         if let Some(wired) = &mut self.look {
-            wired.lookahead.restore(words)?;
+            wired.observer.restore(words)?;
         }
         self.contacts.iter_mut().try_for_each(|contact| contact.energy.restore(words))
     }

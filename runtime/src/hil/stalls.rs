@@ -114,9 +114,9 @@ impl Plan {
 type Shared = Rc<RefCell<Plan>>;
 
 /// A simulated clock whose sleeps may stall.
-struct Late(Simulation, Shared);
+struct StallingClock(Simulation, Shared);
 
-impl Clock for Late {
+impl Clock for StallingClock {
     fn now_ns(&self) -> u64 {
         self.0.now_ns()
     }
@@ -191,7 +191,7 @@ fn run(script: &Script) -> Result<Shown, String> {
         stalled: None,
         sent: Vec::new(),
     }));
-    let clock = Box::new(Late(world.simulation().clone(), plan.clone()));
+    let clock = Box::new(StallingClock(world.simulation().clone(), plan.clone()));
     let bus = Box::new(Slow(world.bus(0).port(super::simulated::MASTER), plan.clone()));
     let (mut hil, mut operator) = Hil::new(&rig, model, clock, vec![bus], quick(), None).unwrap();
     let bites = Arc::new(Mutex::new(Vec::new()));

@@ -7,7 +7,7 @@
 
 use super::coupling::{Contact, contacts};
 use crate::coupling::lag::Lag;
-use crate::coupling::predictor::{self, Lookahead, Torque};
+use crate::coupling::predictor::{self, ShaftObserver, Torque};
 use abi::rig::{Kind, Rig, SignalKind};
 use abi::{Instance, Slot};
 
@@ -169,7 +169,7 @@ impl Stand<'_> {
         let told = rig.outputs.iter().any(other);
         let mut look = looks.then(|| {
             let torques = vec![Torque::new(dead_ns, node.lag), Torque::new(0, 0.0)];
-            Lookahead::new(*inertia, rig.period_ns, drive.count, torques)
+            ShaftObserver::new(*inertia, rig.period_ns, drive.count, torques)
         });
         let (mut x, mut v) = (0.0, 0.0);
         let mut give = |v: f64, x: f64, steps: u64| {

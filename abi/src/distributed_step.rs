@@ -14,7 +14,7 @@ use std::sync::Arc;
 
 /// Machine code of the remaining part: as [`Entry`](crate::table::Entry), for `count` steps. `ahead` holds the values
 /// computed ahead: value `k` of step `i` is `ahead[k · lanes + i]`.
-pub type RestEntry = unsafe extern "C" fn(block: *mut f64, pool: *const f64, count: u64, ahead: *const f64) -> u64;
+pub type RemainingEntry = unsafe extern "C" fn(block: *mut f64, pool: *const f64, count: u64, ahead: *const f64) -> u64;
 
 /// Capacity of the stack buffer, in numbers: 32 KiB.
 const ROOM: usize = 4096;
@@ -24,16 +24,16 @@ const INSTANTS: usize = 64;
 
 /// A step in two parts.
 #[derive(Clone)]
-pub struct Ahead {
+pub struct DistributedStep {
     once: Option<Lanes>,
     instants: Lanes,
     layout: Layout,
     loads: Vec<Slot>,
-    rest: RestEntry,
+    rest: RemainingEntry,
     _memory: Arc<dyn Any + Send + Sync>,
 }
 
-impl Ahead {
+impl DistributedStep {
     /// Combines the parts. `None` if they exceed the stack buffer or the maximum number of instants.
     ///
     /// `instants` and `once` work on a block of their own with the layout `layout`. It has time and count; its
@@ -48,9 +48,9 @@ impl Ahead {
         instants: Lanes,
         layout: Layout,
         loads: Vec<Slot>,
-        rest: RestEntry,
+        rest: RemainingEntry,
         memory: Arc<dyn Any + Send + Sync>,
-    ) -> Option<Ahead> {
+    ) -> Option<DistributedStep> {
         let both = || once.iter().chain([&instants]);
         assert_eq!(loads.len(), layout.params.len as usize, "a parameter for each number that is loaded");
         assert!(
@@ -58,7 +58,7 @@ impl Ahead {
             "parts that fit"
         );
         let fits = both().all(|lanes| lanes.room() <= ROOM && lanes.width() <= INSTANTS);
-        fits.then_some(Ahead { once, instants, layout, loads, rest, _memory: memory })
+        fits.then_some(DistributedStep { once, instants, layout, loads, rest, _memory: memory })
     }
 
     /// Smallest number of steps for which computing ahead pays off.
