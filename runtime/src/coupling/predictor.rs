@@ -19,7 +19,7 @@ use abi::rig::{Kind, Rig, Signal, SignalKind};
 /// Short steps of the observer per period, and of the prediction.
 const STEPS: u64 = 32;
 
-/// ShaftObserver poles at a period of 1 ms; at other periods the time constant is the same.
+/// Observer poles at a period of 1 ms; at other periods the time constant is the same.
 const THETA_AT_1_MS: f64 = 0.9;
 
 /// A residual greater than this multiple of its usual size (one count, or its own running mean) indicates a deviation
