@@ -7,7 +7,7 @@ use crate::equations::expression;
 use grammar::ast::{BindValue, DeclarationKind, Expr, ExprKind, Model, Statement, Target};
 
 /// A part, or the environment of the model.
-struct Block {
+struct DiagramBlock {
     name: String,
     /// `LuGre`, `Friction = LuGre`; empty for the environment.
     kind: String,
@@ -24,7 +24,7 @@ struct Wire {
 }
 
 struct Diagram {
-    blocks: Vec<Block>,
+    blocks: Vec<DiagramBlock>,
     wires: Vec<Wire>,
 }
 
@@ -68,14 +68,15 @@ fn diagram(model: &Model) -> Diagram {
         Statement::Declaration(d) if d.kind == DeclarationKind::Input => Some(d.name.text.clone()),
         _ => None,
     });
-    let outside = Block { name: String::new(), kind: String::new(), inputs: Vec::new(), outputs: own_inputs.collect() };
+    let outside =
+        DiagramBlock { name: String::new(), kind: String::new(), inputs: Vec::new(), outputs: own_inputs.collect() };
     blocks.push(outside);
     for statement in &model.body {
         let Statement::Part(part) = statement else { continue };
         let rotary = if part.instance.rotary { "rotary " } else { "" };
         let is = format!("{rotary}{}", part.instance.model.text);
         let kind = part.slot.as_ref().map_or(is.clone(), |slot| format!("{} = {is}", slot.interface.text));
-        let mut block = Block { name: part.name.text.clone(), kind, inputs: Vec::new(), outputs: Vec::new() };
+        let mut block = DiagramBlock { name: part.name.text.clone(), kind, inputs: Vec::new(), outputs: Vec::new() };
         for bind in &part.instance.args {
             let BindValue::Expr(value) = &bind.value else { continue };
             let mut found = Vec::new();
@@ -90,7 +91,8 @@ fn diagram(model: &Model) -> Diagram {
     }
     // The model's own outputs.
     let end = blocks.len();
-    let mut leaving = Block { name: String::new(), kind: String::new(), inputs: Vec::new(), outputs: Vec::new() };
+    let mut leaving =
+        DiagramBlock { name: String::new(), kind: String::new(), inputs: Vec::new(), outputs: Vec::new() };
     for (name, value, output) in model.body.iter().filter_map(computed) {
         let mut found = Vec::new();
         paths(value, &mut found);
@@ -177,12 +179,12 @@ pub fn svg(model: &Model) -> String {
     let Diagram { blocks, wires } = diagram(model);
     let letters = |text: &str| text.chars().count() as f64 * LETTER;
     let is_wired = |block: usize, row: usize| wires.iter().any(|wire| wire.to == (block, row));
-    let before = |k: usize, block: &Block| -> Vec<(usize, String)> {
+    let before = |k: usize, block: &DiagramBlock| -> Vec<(usize, String)> {
         let loose = block.inputs.iter().enumerate().filter(|(row, _)| !block.name.is_empty() && !is_wired(k, *row));
         loose.map(|(row, (_, value))| (row, value.clone())).collect()
     };
     // A box has ports; an output of the model is an equation.
-    let shown = |block: &Block, (name, value): &(String, String)| match block.name.is_empty() {
+    let shown = |block: &DiagramBlock, (name, value): &(String, String)| match block.name.is_empty() {
         true => format!("{name} = {value}"),
         false => name.clone(),
     };

@@ -111,7 +111,7 @@ fn by_file(diagnostics: &[Diagnostic]) -> Vec<Vec<&Diagnostic>> {
 }
 
 /// The position of a label as users count it.
-struct Place<'a> {
+struct LabelPosition<'a> {
     file: &'a str,
     line: usize,
     column: usize,
@@ -119,7 +119,7 @@ struct Place<'a> {
     end: (usize, usize),
 }
 
-impl fmt::Display for Place<'_> {
+impl fmt::Display for LabelPosition<'_> {
     fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
         write!(f, "{}:{}:{}", self.file, self.line, self.column)
     }
@@ -136,11 +136,11 @@ impl<'a> Places<'a> {
         Places { files, lines: HashMap::new() }
     }
 
-    fn of(&mut self, span: Span) -> Option<Place<'a>> {
+    fn of(&mut self, span: Span) -> Option<LabelPosition<'a>> {
         let file = self.files.get(span.file.0 as usize)?;
         let lines = self.lines.entry(span.file).or_insert_with(|| Lines::new(&file.text));
         let (line, column) = lines.place(span.start as usize);
-        Some(Place { file: &file.name, line, column, end: lines.place(span.end as usize) })
+        Some(LabelPosition { file: &file.name, line, column, end: lines.place(span.end as usize) })
     }
 }
 

@@ -7,7 +7,7 @@
 //! Source: Kennedy, Allen, *Optimizing Compilers for Modern Architectures*, 2001, ch. 5.
 
 use crate::description::{Layout, Slot};
-use crate::lanes::{Lanes, Line};
+use crate::lanes::{Aligned, Lanes};
 use std::any::Any;
 use std::mem::MaybeUninit;
 use std::sync::Arc;
@@ -82,7 +82,7 @@ impl DistributedStep {
         }
         let step = block[Slot::STEP.index()];
         let width = self.instants.width();
-        let mut room = MaybeUninit::<[Line; ROOM / 8]>::uninit();
+        let mut room = MaybeUninit::<[Aligned; ROOM / 8]>::uninit();
         let mut statuses = [0; INSTANTS];
         let (numbers, statuses) = (room.as_mut_ptr().cast::<f64>(), statuses.as_mut_ptr());
         let set = |slot: Slot, lane: usize, value: f64| {

@@ -79,20 +79,20 @@ impl Lanes {
 /// Eight numbers, aligned for vectors.
 #[derive(Clone, Copy)]
 #[repr(C, align(64))]
-pub(crate) struct Line([u64; 8]);
+pub(crate) struct Aligned([u64; 8]);
 
 /// The blocks of as many instances as the code has lanes.
 #[derive(Clone)]
 pub struct Batch {
     lanes: Lanes,
-    numbers: Vec<Line>,
-    statuses: Vec<Line>,
+    numbers: Vec<Aligned>,
+    statuses: Vec<Aligned>,
 }
 
 impl Batch {
     /// A batch in which all numbers are 0.
     pub fn new(lanes: Lanes) -> Batch {
-        let lines = |numbers: usize| vec![Line([0; 8]); numbers.div_ceil(8)];
+        let lines = |numbers: usize| vec![Aligned([0; 8]); numbers.div_ceil(8)];
         let numbers = lines(lanes.room());
         let statuses = lines(lanes.width);
         Batch { lanes, numbers, statuses }
@@ -187,7 +187,7 @@ impl Batch {
         let needed = self.lanes.pool_len;
         assert!(pool.len() >= needed, "pool of {} numbers, {needed} needed", pool.len());
         let mut done = 0;
-        self.statuses.fill(Line([0; 8]));
+        self.statuses.fill(Aligned([0; 8]));
         while done < n && (0..self.lanes.width).all(|lane| self.status(lane) == 0) {
             let (numbers, statuses) = (self.numbers.as_mut_ptr().cast(), self.statuses.as_mut_ptr().cast());
             // SAFETY: `Batch::new` has allocated the numbers and statuses, and the length of the pool was checked.

@@ -41,7 +41,7 @@ enum Command {
     /// Verify a package: its hashes, its target, its version, and its signature if keys are trusted
     Check(Check),
     /// Run the current package, or the one named; nothing moves before `say enable`, `say arm`
-    Run(Run),
+    Run(RunArgs),
     /// Run the current package in the background; fails if it ends within its first second
     Start(Start),
     /// Simulate the drives and devices of a package on a bus that other programs can reach
@@ -102,7 +102,7 @@ struct Register {
 }
 
 #[derive(clap::Args, Debug)]
-struct Run {
+struct RunArgs {
     /// The package [default: the one that is installed]
     #[arg(value_name = "FILE.fricpkg", value_hint = ValueHint::FilePath)]
     package: Option<PathBuf>,
@@ -289,7 +289,7 @@ fn served(args: &Drives) -> Result<u8, String> {
 }
 
 /// Runs a package.
-fn ran(args: &Run) -> Result<u8, String> {
+fn ran(args: &RunArgs) -> Result<u8, String> {
     let wanted = run::RunArguments {
         package: args.package.as_deref(),
         trusted: &args.trust.keys.trusted,

@@ -7,7 +7,7 @@ use crate::can::sim::{Actor, Port, Simulation};
 use crate::can::{Bus, Frame, Received};
 use crate::realtime::clock::Clock;
 use crate::realtime::histogram::Histogram;
-use crate::realtime::threads::{self, Refusal, Wishes};
+use crate::realtime::threads::{self, RefusedWish, Wishes};
 
 /// Results of a run.
 pub struct Report {
@@ -30,7 +30,7 @@ pub struct Report {
     /// Page faults during the run.
     pub page_faults: u64,
     /// Wishes that the system refused.
-    pub refused: Vec<Refusal>,
+    pub refused: Vec<RefusedWish>,
 }
 
 /// Assessment of a machine.

@@ -64,26 +64,26 @@ pub fn findings(
     stepped: &[String],
     chatter: Option<&str>,
 ) -> Vec<Finding> {
-    let look = Look { subject, scales, tests, stepped, chatter };
+    let look = Looked { subject, scales, tests, stepped, chatter };
     vec![
-        look.finding("holds", "holds a load at rest", Look::holds),
-        look.finding("no_drift", "keeps its place when shaken", Look::no_drift),
-        look.finding("stiction_peak", "stiction peak", Look::stiction_peak),
-        look.finding("stribeck", "Stribeck curve", Look::stribeck),
-        look.finding("viscous", "viscous friction", Look::viscous),
-        look.finding("presliding", "presliding displacement", Look::presliding),
-        look.finding("hysteresis", "presliding hysteresis", Look::hysteresis),
-        look.finding("return_point_memory", "return-point memory", Look::memory),
-        look.finding("lag", "frictional lag", Look::lag),
-        look.finding("varying_break_away", "varying break-away", Look::varying),
-        look.finding("stick_slip", "stick-slip on a spring", Look::stick_slip),
-        look.finding("rate_independent", "rate independent", Look::rate_independent),
-        look.finding("dissipative", "dissipative", Look::dissipative),
-        look.finding("symmetric", "symmetric", Look::symmetric),
+        look.finding("holds", "holds a load at rest", Looked::holds),
+        look.finding("no_drift", "keeps its place when shaken", Looked::no_drift),
+        look.finding("stiction_peak", "stiction peak", Looked::stiction_peak),
+        look.finding("stribeck", "Stribeck curve", Looked::stribeck),
+        look.finding("viscous", "viscous friction", Looked::viscous),
+        look.finding("presliding", "presliding displacement", Looked::presliding),
+        look.finding("hysteresis", "presliding hysteresis", Looked::hysteresis),
+        look.finding("return_point_memory", "return-point memory", Looked::memory),
+        look.finding("lag", "frictional lag", Looked::lag),
+        look.finding("varying_break_away", "varying break-away", Looked::varying),
+        look.finding("stick_slip", "stick-slip on a spring", Looked::stick_slip),
+        look.finding("rate_independent", "rate independent", Looked::rate_independent),
+        look.finding("dissipative", "dissipative", Looked::dissipative),
+        look.finding("symmetric", "symmetric", Looked::symmetric),
     ]
 }
 
-struct Look<'a> {
+struct Looked<'a> {
     subject: &'a Subject,
     scales: &'a Scales,
     tests: &'a [Test],
@@ -116,7 +116,7 @@ fn when(shown: bool, why: String) -> Answer {
     (if shown { Seen::Shown } else { Seen::NotShown }, why)
 }
 
-impl Look<'_> {
+impl Looked<'_> {
     fn finding(&self, key: &'static str, name: &'static str, look: fn(&Self) -> Answer) -> Finding {
         let (seen, why) = look(self);
         // What a fixed step shows of a model that cannot be run is no evidence against it.

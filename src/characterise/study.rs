@@ -179,7 +179,7 @@ pub fn study(subject: Subject, name: &str, sources: &(dyn Sources + Sync), exten
     let text = battery::text(&subject.imports, &layout.head(), &runner.entries);
     let dissipation = runner.dissipation(&text);
     let (chatter, slow) = (runner.chatter.clone(), runner.slow);
-    let reader = Reader {
+    let reader = StudyReader {
         results: &runner.results,
         layout: &layout,
         units,
@@ -407,7 +407,7 @@ impl Steady {
 }
 
 /// Extracts tests from results.
-struct Reader<'a> {
+struct StudyReader<'a> {
     results: &'a Results,
     layout: &'a Layout<'a>,
     units: Units,
@@ -424,7 +424,7 @@ const JUMPS: &str = "at rest its force jumps to and fro";
 
 type Read = Result<(Vec<Graph>, Vec<Number>), String>;
 
-impl Reader<'_> {
+impl StudyReader<'_> {
     fn tests(&self, dissipation: Option<Verdict>) -> Vec<Test> {
         let s = self.scales;
         let test = |key, title, how: String, read: Read| {

@@ -8,7 +8,7 @@ use crate::terminal::Terminal;
 use abi::rig::{Kind, Message};
 use runtime::can::address::Address;
 use runtime::can::bridge::Hub;
-use runtime::can::log::Entry;
+use runtime::can::log::LoggedFrame;
 use runtime::can::sim::Simulation;
 use runtime::can::slcan::Slcan;
 use runtime::can::socketcand::Server;
@@ -217,7 +217,7 @@ fn log_line(page: &mut String, from: &str, received: &Received, origin_ns: u64) 
     if let Received::Frame(frame, at_ns) = received {
         // Readers of logs end a name at white space.
         let interface = from.replace(char::is_whitespace, "_");
-        let _ = writeln!(page, "{}", Entry { time_ns: origin_ns + at_ns, interface, frame: *frame });
+        let _ = writeln!(page, "{}", LoggedFrame { time_ns: origin_ns + at_ns, interface, frame: *frame });
     }
 }
 

@@ -19,7 +19,7 @@ use runtime::hil::session::{self, Drives, Finished, Session, Setup};
 use runtime::hil::simulated::{Pace, World};
 use runtime::hil::{cycle, emergency, watches, words};
 use runtime::realtime::clock::Clock;
-use runtime::realtime::threads::Refusal;
+use runtime::realtime::threads::RefusedWish;
 use runtime::record::log::{Sections, Settings, Sink};
 use runtime::record::parts::{self, Limits};
 use std::io::IsTerminal;
@@ -363,7 +363,7 @@ fn checked(rig: &Rig, hil: &Hil, terminal: &mut Terminal) {
     terminal.line("  checks passed: nothing was armed");
 }
 
-fn begin(rig: &Rig, drives: Drives, refused: &[Refusal], notes: &[String], terminal: &mut Terminal) {
+fn begin(rig: &Rig, drives: Drives, refused: &[RefusedWish], notes: &[String], terminal: &mut Terminal) {
     let rate = 1e9 / rig.period_ns as f64;
     let kind = match drives {
         Drives::Real => "drives on their buses",

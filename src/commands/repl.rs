@@ -7,7 +7,7 @@ use crate::commands::shared::session::{
 };
 use crate::compile::Explanation;
 use crate::plot::{self, Axis, Curve, Figure, Panel};
-use crate::repl::{self, COMMANDS, Command, Cut, Editor, Fault, Input, Line, Ran, Session, Value, plain};
+use crate::repl::{self, COMMANDS, Cut, Editor, Fault, Input, LineKind, PromptCommand, Ran, Session, Value, plain};
 use crate::terminal::{Style, Terminal};
 use crate::{diagram, equations, project, report, results};
 use abi::unit::Unit;
@@ -123,13 +123,18 @@ impl Prompt<'_> {
         let text = text.trim_end();
         let line = repl::read(text);
         let brings = match &line {
-            Line::Nothing => return Ok(Next::Line),
-            Line::Command(command, _) => matches!(
+            LineKind::Nothing => return Ok(Next::Line),
+            LineKind::Command(command, _) => matches!(
                 command,
-                Command::Run | Command::Explain | Command::Doc | Command::Diagram | Command::Plot | Command::Expect
+                PromptCommand::Run
+                    | PromptCommand::Explain
+                    | PromptCommand::Doc
+                    | PromptCommand::Diagram
+                    | PromptCommand::Plot
+                    | PromptCommand::Expect
             ),
-            Line::Item | Line::Instance(..) | Line::Setting(..) => true,
-            Line::Expression => false,
+            LineKind::Item | LineKind::Instance(..) | LineKind::Setting(..) => true,
+            LineKind::Expression => false,
         };
         if brings {
             let brought = self.session.bring_in(text);
@@ -138,17 +143,17 @@ impl Prompt<'_> {
             }
         }
         match line {
-            Line::Nothing => {}
-            Line::Item => {
+            LineKind::Nothing => {}
+            LineKind::Item => {
                 if let Some(warnings) = self.session.add_item(text)? {
                     tell_fault(&warnings, self.terminal);
                 }
             }
-            Line::Instance(name, begin) => {
+            LineKind::Instance(name, begin) => {
                 let words = self.session.add_part(&name, &text[begin..])?;
                 self.terminal.line(&words);
             }
-            Line::Setting(path, begin) if !path.contains(['.', '[']) && self.session.is_free(&path) => {
+            LineKind::Setting(path, begin) if !path.contains(['.', '[']) && self.session.is_free(&path) => {
                 let value = self.session.set_variable(&path, &text[begin..])?;
                 let tail = format!(".{path}");
                 let meant =
@@ -158,8 +163,8 @@ impl Prompt<'_> {
                 });
                 self.terminal.line(&format!("{path} = {}{meant}", plain(&value)));
             }
-            Line::Setting(path, _) => self.session.set(&path, text)?,
-            Line::Expression => {
+            LineKind::Setting(path, _) => self.session.set(&path, text)?,
+            LineKind::Expression => {
                 if let Some(values) = self.session.part_values(text.trim()) {
                     self.values(values?);
                     return Ok(Next::Line);
@@ -171,7 +176,7 @@ impl Prompt<'_> {
                 self.session.answer(&value);
                 self.terminal.line(&plain(&value));
             }
-            Line::Command(command, rest) => return self.command(command, rest.trim()),
+            LineKind::Command(command, rest) => return self.command(command, rest.trim()),
         }
         Ok(Next::Line)
     }
@@ -206,20 +211,20 @@ impl Prompt<'_> {
             .then(|| format!("there is no command `{first}`; did you mean `{near}`? (`help` lists them)"))
     }
 
-    fn command(&mut self, command: Command, rest: &str) -> Result<Next, Fault> {
+    fn command(&mut self, command: PromptCommand, rest: &str) -> Result<Next, Fault> {
         match command {
-            Command::Quit => return Ok(Next::Quit),
-            Command::Help => self.help(rest)?,
-            Command::Use => {
+            PromptCommand::Quit => return Ok(Next::Quit),
+            PromptCommand::Help => self.help(rest)?,
+            PromptCommand::Use => {
                 let words = self.session.add_file(rest)?;
                 self.terminal.line(&words);
             }
-            Command::Run => return self.run(rest),
-            Command::Step => self.step(rest)?,
-            Command::Plot => self.plot(rest)?,
-            Command::Expect => return self.expect(rest),
-            Command::Explain => self.explain(rest)?,
-            Command::Show => {
+            PromptCommand::Run => return self.run(rest),
+            PromptCommand::Step => self.step(rest)?,
+            PromptCommand::Plot => self.plot(rest)?,
+            PromptCommand::Expect => return self.expect(rest),
+            PromptCommand::Explain => self.explain(rest)?,
+            PromptCommand::Show => {
                 if rest.is_empty() {
                     return Err("show what? `show f`, `show max(x)`".into());
                 }
@@ -232,17 +237,17 @@ impl Prompt<'_> {
                     }
                 }
             }
-            Command::Unit => self.unit(rest)?,
-            Command::Doc => self.doc(rest)?,
-            Command::Deps => self.deps(rest)?,
-            Command::Diagram => self.diagram(rest)?,
-            Command::Names => self.names(),
-            Command::Lints => self.lints(),
-            Command::Why => match super::explain::page_of(rest) {
+            PromptCommand::Unit => self.unit(rest)?,
+            PromptCommand::Doc => self.doc(rest)?,
+            PromptCommand::Deps => self.deps(rest)?,
+            PromptCommand::Diagram => self.diagram(rest)?,
+            PromptCommand::Names => self.names(),
+            PromptCommand::Lints => self.lints(),
+            PromptCommand::Why => match super::explain::page_of(rest) {
                 Some(page) => self.terminal.print(page),
                 None => return Err(Fault::Words(super::explain::no_page(rest))),
             },
-            Command::Watch => {
+            PromptCommand::Watch => {
                 let (file, name) = split_file(rest);
                 if file.is_empty() {
                     return Err("watch what? `watch \"FILE.fric\" [EXPERIMENT]`".into());
@@ -252,8 +257,8 @@ impl Prompt<'_> {
                     End::Failed | End::Misused | End::Stopped => Ok(Next::Missed),
                 };
             }
-            Command::Characterise => self.characterise(rest)?,
-            Command::Save => self.save(rest)?,
+            PromptCommand::Characterise => self.characterise(rest)?,
+            PromptCommand::Save => self.save(rest)?,
         }
         Ok(Next::Line)
     }

@@ -71,7 +71,7 @@ pub fn sweep(args: &Sweep, terminal: &mut Terminal) -> End {
         ));
         return End::Misused;
     }
-    let table = match Table::new(args, cases, best) {
+    let table = match SweepTable::new(args, cases, best) {
         Ok(table) => table,
         Err(message) => {
             terminal.error(&message);
@@ -135,7 +135,7 @@ fn rows_of(out: &Path) -> PathBuf {
 }
 
 /// All runs of a sweep and the columns of its table.
-struct Table {
+struct SweepTable {
     cases: Vec<Varying>,
     vary: Vec<Vary>,
     /// For each case the slots of the parameters.
@@ -157,7 +157,7 @@ struct Writing<'a> {
 }
 
 /// A run of a sweep.
-struct Run {
+struct SweepRun {
     number: u64,
     /// Number of its case.
     at: usize,
@@ -220,8 +220,8 @@ fn window(expect: &Expect, duration: f64) -> (f64, f64) {
     (expect.after, if expect.before >= duration { f64::INFINITY } else { expect.before })
 }
 
-impl Table {
-    fn new(args: &Sweep, cases: Vec<Varying>, best: Option<Best>) -> Result<Table, String> {
+impl SweepTable {
+    fn new(args: &Sweep, cases: Vec<Varying>, best: Option<Best>) -> Result<SweepTable, String> {
         let mut slots = Vec::new();
         for case in &cases {
             let mut of_case = Vec::new();
@@ -257,7 +257,7 @@ impl Table {
             }
             None => None,
         };
-        Ok(Table { cases, vary: args.vary.clone(), slots, grid, draws, seed: args.seed, columns, best })
+        Ok(SweepTable { cases, vary: args.vary.clone(), slots, grid, draws, seed: args.seed, columns, best })
     }
 
     fn total(&self) -> u64 {
@@ -338,7 +338,7 @@ impl Table {
                     Err(row) => desk.hand_in(number, Some(row)),
                 }
             };
-            let mut give = |run: Run, result| {
+            let mut give = |run: SweepRun, result| {
                 let number = run.number;
                 desk.hand_in(number, self.row(run, result));
             };
@@ -347,19 +347,19 @@ impl Table {
     }
 
     /// A run with its values; or the row of a run that its values do not allow.
-    fn fitted(&self, number: u64, dice: &Dice) -> Result<(Run, PreparedRun), Vec<u8>> {
+    fn fitted(&self, number: u64, dice: &Dice) -> Result<(SweepRun, PreparedRun), Vec<u8>> {
         let (at, values) = self.values(number, dice);
         let given: Vec<(Slot, f64)> = self.slots[at].iter().copied().zip(values.iter().copied()).collect();
         let description = |fitted: &PreparedRun| fitted.instance.description().clone();
         match self.cases[at].at(&given) {
-            Ok(fitted) => Ok((Run { number, at, values, description: description(&fitted) }, fitted)),
+            Ok(fitted) => Ok((SweepRun { number, at, values, description: description(&fitted) }, fitted)),
             Err(broken) => Err(self.cells(number, at, &values, &[], &format!("not run: {broken}"))),
         }
     }
 
     /// The outcome of a run as a row; none if it was stopped.
-    fn row(&self, run: Run, result: Result<Outcome, Failure>) -> Option<Vec<u8>> {
-        let Run { number, at, values, description } = run;
+    fn row(&self, run: SweepRun, result: Result<Outcome, Failure>) -> Option<Vec<u8>> {
+        let SweepRun { number, at, values, description } = run;
         let case = &self.cases[at];
         let mut yields: Vec<Yield> = Vec::new();
         let status = match result {

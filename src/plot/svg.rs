@@ -95,7 +95,8 @@ pub fn inline(figure: &Figure, look: &Look, wide: f64, id: &str) -> String {
         for (column, panel) in row.iter().enumerate() {
             let id = format!("{id}{}", number * columns + column);
             let left = cell * column as f64 + frame.left;
-            let place = Place { left, top, width: (cell - frame.left - frame.right).max(LEAST), height: tall, frame };
+            let place =
+                PanelPlace { left, top, width: (cell - frame.left - frame.right).max(LEAST), height: tall, frame };
             draw_panel(&mut body, &panel.placed(), &id, place, pen);
         }
         let last = number + 1 == rows.len() && look.size.is_some();
@@ -139,7 +140,7 @@ fn frame(figure: &Figure, look: &Look, k: f64) -> Frame {
 
 /// Where the axes of a panel are.
 #[derive(Clone, Copy)]
-struct Place {
+struct PanelPlace {
     left: f64,
     top: f64,
     width: f64,
@@ -173,8 +174,8 @@ fn above(panel: &Panel, cell: f64, frame: Frame, k: f64) -> f64 {
     title + legend + 8.0 * k
 }
 
-fn draw_panel(out: &mut String, panel: &Panel, id: &str, place: Place, pen: Pen) {
-    let Place { left, top, width, height, frame } = place;
+fn draw_panel(out: &mut String, panel: &Panel, id: &str, place: PanelPlace, pen: Pen) {
+    let PanelPlace { left, top, width, height, frame } = place;
     let (k, bottom) = (pen.k, top + height);
     let bounds = panel.bounds();
     let (xs, ys) = bounds.unwrap_or(((0.0, 1.0), (0.0, 1.0)));
@@ -368,7 +369,7 @@ fn equal_scale(panel: &Panel, xs: (f64, f64), ys: (f64, f64), aspect: f64) -> ((
 }
 
 /// An entry of a legend: its place from the left top of the legend, its name, and its curve; none for a band.
-struct Entry {
+struct LegendEntry {
     x: f64,
     y: f64,
     name: String,
@@ -376,7 +377,7 @@ struct Entry {
 }
 
 /// The entries of a legend, if there are several curves and bands.
-fn entries(panel: &Panel, wide: f64, k: f64) -> Vec<Entry> {
+fn entries(panel: &Panel, wide: f64, k: f64) -> Vec<LegendEntry> {
     let mut out = Vec::new();
     if panel.curves.len() + panel.bands.len() < 2 {
         return out;
@@ -391,7 +392,7 @@ fn entries(panel: &Panel, wide: f64, k: f64) -> Vec<Entry> {
             x = 0.0;
             y += ROW * k;
         }
-        out.push(Entry { x, y, name, curve });
+        out.push(LegendEntry { x, y, name, curve });
         x += taken + 18.0 * k;
     }
     out
@@ -401,7 +402,7 @@ fn entries(panel: &Panel, wide: f64, k: f64) -> Vec<Entry> {
 fn legend(out: &mut String, panel: &Panel, ranks: &[usize], (left, top): (f64, f64), wide: f64, pen: Pen) {
     let k = pen.k;
     let mut shade = SHADES.iter().cycle();
-    for Entry { x, y, name, curve } in entries(panel, wide, k) {
+    for LegendEntry { x, y, name, curve } in entries(panel, wide, k) {
         let (x, y) = (left + x, top + y);
         let middle = y - 4.5 * k;
         let _ = match curve {
@@ -486,7 +487,7 @@ fn marker(i: usize, x: f64, y: f64, colour: &str, k: f64) -> String {
 }
 
 /// Six places along the lines of a curve, others for each curve so that markers do not cover each other.
-fn along(lines: &[decimate::Line], i: usize, place: Place) -> Vec<(f64, f64)> {
+fn along(lines: &[decimate::Line], i: usize, place: PanelPlace) -> Vec<(f64, f64)> {
     const MARKERS: usize = 6;
     let inside = |(x, y): &(f64, f64)| {
         (place.left..=place.left + place.width).contains(x) && (place.top..=place.top + place.height).contains(y)
@@ -563,8 +564,8 @@ fn covers(lower: &[decimate::Line], upper: &[decimate::Line], pen: f64) -> bool 
 }
 
 /// The lines of a curve in px, without the parts far outside the axes.
-fn lines_of(curve: &Curve, px: impl Fn(f64) -> f64, py: impl Fn(f64) -> f64, place: Place) -> Vec<decimate::Line> {
-    let Place { left, top, width, height, .. } = place;
+fn lines_of(curve: &Curve, px: impl Fn(f64) -> f64, py: impl Fn(f64) -> f64, place: PanelPlace) -> Vec<decimate::Line> {
+    let PanelPlace { left, top, width, height, .. } = place;
     let near = |value: f64, from: f64, size: f64| value.clamp(from - 20.0 * size, from + 21.0 * size);
     let place = |&(x, y): &(f64, f64)| {
         let finite = x.is_finite() && y.is_finite();

@@ -1,6 +1,6 @@
 //! Classifies a line: a command, an item of the language, an instance, a setting or an expression.
 //!
-//! In: a line. Out: a [`Line`]. Knows no session: names are not resolved here.
+//! In: a line. Out: a [`LineKind`]. Knows no session: names are not resolved here.
 
 use grammar::tokens::{TokenKind, tokens};
 
@@ -38,7 +38,7 @@ const ITEMS: &[&str] = &["import", "const", "fn", "table", "interface", "model",
 /// A command.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 #[allow(missing_docs)]
-pub enum Command {
+pub enum PromptCommand {
     Use,
     Run,
     Step,
@@ -60,28 +60,28 @@ pub enum Command {
     Quit,
 }
 
-impl Command {
-    fn named(word: &str) -> Option<Command> {
+impl PromptCommand {
+    fn named(word: &str) -> Option<PromptCommand> {
         Some(match word {
-            "use" => Command::Use,
-            "run" => Command::Run,
-            "step" => Command::Step,
-            "plot" => Command::Plot,
-            "expect" => Command::Expect,
-            "explain" => Command::Explain,
-            "show" => Command::Show,
-            "unit" => Command::Unit,
-            "doc" => Command::Doc,
-            "deps" => Command::Deps,
-            "diagram" => Command::Diagram,
-            "names" => Command::Names,
-            "lints" => Command::Lints,
-            "why" => Command::Why,
-            "watch" => Command::Watch,
-            "characterise" | "characterize" => Command::Characterise,
-            "save" => Command::Save,
-            "help" => Command::Help,
-            "quit" | "exit" => Command::Quit,
+            "use" => PromptCommand::Use,
+            "run" => PromptCommand::Run,
+            "step" => PromptCommand::Step,
+            "plot" => PromptCommand::Plot,
+            "expect" => PromptCommand::Expect,
+            "explain" => PromptCommand::Explain,
+            "show" => PromptCommand::Show,
+            "unit" => PromptCommand::Unit,
+            "doc" => PromptCommand::Doc,
+            "deps" => PromptCommand::Deps,
+            "diagram" => PromptCommand::Diagram,
+            "names" => PromptCommand::Names,
+            "lints" => PromptCommand::Lints,
+            "why" => PromptCommand::Why,
+            "watch" => PromptCommand::Watch,
+            "characterise" | "characterize" => PromptCommand::Characterise,
+            "save" => PromptCommand::Save,
+            "help" => PromptCommand::Help,
+            "quit" | "exit" => PromptCommand::Quit,
             _ => return None,
         })
     }
@@ -89,11 +89,11 @@ impl Command {
 
 /// The kind of a line.
 #[derive(Clone, PartialEq, Eq, Debug)]
-pub enum Line {
+pub enum LineKind {
     /// Blanks and comments.
     Nothing,
     /// A command, and the text after its name.
-    Command(Command, String),
+    Command(PromptCommand, String),
     /// `model M { … }`, `const k = 2 N/m`.
     Item,
     /// `f = LuGre(vd = 10 mm/s)`: the name, and the offset of the instance.
@@ -105,27 +105,27 @@ pub enum Line {
 }
 
 /// Classifies a line.
-pub fn read(line: &str) -> Line {
+pub fn read(line: &str) -> LineKind {
     let words: Vec<_> = tokens(line).into_iter().filter(|token| !token.is_trivia()).collect();
-    let Some(first) = words.first() else { return Line::Nothing };
+    let Some(first) = words.first() else { return LineKind::Nothing };
     let word = first.text(line);
     let next = words.get(1).map(|token| token.text(line));
-    if let Some(command) = Command::named(word) {
+    if let Some(command) = PromptCommand::named(word) {
         let glued = words.get(1).is_some_and(|token| token.start == first.end);
         let name = matches!(next, Some("=" | ".")) || (glued && next == Some("("));
         if !name {
-            return Line::Command(command, line[first.end..].trim().to_string());
+            return LineKind::Command(command, line[first.end..].trim().to_string());
         }
     }
     if ITEMS.contains(&word) {
-        return Line::Item;
+        return LineKind::Item;
     }
-    let Some(equals) = words.iter().position(|token| token.text(line) == "=") else { return Line::Expression };
+    let Some(equals) = words.iter().position(|token| token.text(line) == "=") else { return LineKind::Expression };
     let path = &words[..equals];
     // `for i = 1:3`: two words in a row are no path.
     let apart = |pair: &[grammar::tokens::Token]| pair.iter().all(|token| token.kind == TokenKind::Word);
     if path.windows(2).any(apart) {
-        return Line::Expression;
+        return LineKind::Expression;
     }
     let of_a_path = |at: usize| match path[at].kind {
         TokenKind::Word | TokenKind::Number => true,
@@ -133,7 +133,7 @@ pub fn read(line: &str) -> Line {
         _ => false,
     };
     if equals == 0 || path[0].kind != TokenKind::Word || !(0..path.len()).all(of_a_path) {
-        return Line::Expression;
+        return LineKind::Expression;
     }
     let left: String = path.iter().map(|token| token.text(line)).collect();
     let begin = words.get(equals + 1).map_or(line.len(), |token| token.start);
@@ -144,8 +144,8 @@ pub fn read(line: &str) -> Line {
     });
     let called = behind.get(1).is_some_and(|token| token.text(line) == "(");
     match model && (called || behind.len() == 1) && !left.contains('.') {
-        true => Line::Instance(left, begin),
-        false => Line::Setting(left, begin),
+        true => LineKind::Instance(left, begin),
+        false => LineKind::Setting(left, begin),
     }
 }
 
@@ -209,21 +209,21 @@ mod tests {
 
     #[test]
     fn lines_are_classified() {
-        let instance = |name: &str, at| Line::Instance(name.into(), at);
-        let setting = |path: &str, at| Line::Setting(path.into(), at);
-        assert_eq!(read("  // nothing"), Line::Nothing);
-        assert_eq!(read("10 mm * 2 N/m"), Line::Expression);
+        let instance = |name: &str, at| LineKind::Instance(name.into(), at);
+        let setting = |path: &str, at| LineKind::Setting(path.into(), at);
+        assert_eq!(read("  // nothing"), LineKind::Nothing);
+        assert_eq!(read("10 mm * 2 N/m"), LineKind::Expression);
         assert_eq!(read("f = LuGre(vd = 10 mm/s)"), instance("f", 4));
         assert_eq!(read("f = rotary LuGre()"), instance("f", 4));
         assert_eq!(read("f = LuGre"), instance("f", 4));
         assert_eq!(read("f.Fs = 1 N"), setting("f.Fs", 7));
         assert_eq!(read("f.el[2].k = 1 N/m"), setting("f.el[2].k", 12));
         assert_eq!(read("s.fr = Karnopp()"), setting("s.fr", 7));
-        assert_eq!(read("f.F == 1 N"), Line::Expression);
-        assert_eq!(read("model M {"), Line::Item);
-        assert_eq!(read("run hunting for 20 s"), Line::Command(Command::Run, "hunting for 20 s".into()));
-        assert_eq!(read("step(1 s, 2 N)"), Line::Expression);
-        assert_eq!(read("plot (f.F)"), Line::Command(Command::Plot, "(f.F)".into()));
+        assert_eq!(read("f.F == 1 N"), LineKind::Expression);
+        assert_eq!(read("model M {"), LineKind::Item);
+        assert_eq!(read("run hunting for 20 s"), LineKind::Command(PromptCommand::Run, "hunting for 20 s".into()));
+        assert_eq!(read("step(1 s, 2 N)"), LineKind::Expression);
+        assert_eq!(read("plot (f.F)"), LineKind::Command(PromptCommand::Plot, "(f.F)".into()));
         assert_eq!(read("unit = LuGre()"), instance("unit", 7));
     }
 
@@ -255,7 +255,7 @@ mod tests {
     #[test]
     fn every_command_that_is_listed_is_known() {
         for (name, ..) in COMMANDS.iter().filter(|(name, ..)| !name.is_empty()) {
-            assert!(Command::named(name).is_some(), "{name}");
+            assert!(PromptCommand::named(name).is_some(), "{name}");
         }
     }
 }

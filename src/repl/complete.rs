@@ -2,7 +2,7 @@
 //!
 //! In: a session, a line, the cursor. Out: candidates, those with a matching unit first. Knows no terminal.
 
-use super::command::{COMMANDS, Line, read};
+use super::command::{COMMANDS, LineKind, read};
 use super::session::{Session, library_models};
 use crate::compile::nearest;
 use abi::unit::{Dimension, Unit};
@@ -109,7 +109,7 @@ fn models(session: &Session) -> impl Iterator<Item = Candidate> + use<> {
 fn model_follows(before: &str) -> bool {
     let before = before.strip_suffix("rotary").unwrap_or(before).trim_end();
     let Some(name) = before.strip_suffix('=') else { return false };
-    matches!(read(&format!("{name}= M()")), Line::Instance(..)) && !name.contains('.')
+    matches!(read(&format!("{name}= M()")), LineKind::Instance(..)) && !name.contains('.')
 }
 
 /// The model whose argument name is expected: `LuGre(` or `LuGre(Fs = 2 N, `.
@@ -176,14 +176,14 @@ fn paths(session: &Session, wanted: Option<Dimension>, word: &str) -> impl Itera
 
 /// The dimension expected for the word at the cursor.
 fn wanted(session: &Session, line: &str, start: usize, cursor: usize) -> Option<Dimension> {
-    if let Line::Setting(path, begin) = read(&line[..start]) {
+    if let LineKind::Setting(path, begin) = read(&line[..start]) {
         let set = session.quantities().find(|q| q.path == path).and_then(|q| dimension(&q.unit));
         if line[begin.min(start)..start].trim().is_empty() {
             return set;
         }
     }
     let line = match read(line) {
-        Line::Command(_, rest) => {
+        LineKind::Command(_, rest) => {
             let at = line.len() - line.trim_start().len() + line.trim().len() - rest.len();
             format!("{}?", &line[at.min(start)..start])
         }

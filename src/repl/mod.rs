@@ -11,7 +11,7 @@ mod complete;
 
 mod line;
 
-pub use command::{COMMANDS, Command, Line, cut_to, inputs, read};
+pub use command::{COMMANDS, LineKind, PromptCommand, cut_to, inputs, read};
 pub use complete::{Candidate, meant};
 pub use line::{Editor, Input, as_typed};
 pub use session::{Cut, Fault, Ran, Session, Value, library_models, plain};

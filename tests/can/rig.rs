@@ -6,7 +6,7 @@ mod nodes;
 use abi::rig::{Mode, Rig, SignalKind};
 use runtime::can::socketcan::SocketCan;
 use runtime::can::{Bus, Options, Received};
-use runtime::drive::Bench;
+use runtime::drive::SimulatedBench;
 use runtime::hil::identify::Identification;
 use runtime::realtime::clock::{Clock, Monotonic};
 use runtime::realtime::threads::{self, Wishes};
@@ -28,7 +28,7 @@ pub fn pulsed(period_ns: u64) -> Identification {
 pub fn drives(rig: &Rig, interface: &str, priority: Option<i32>, over: &AtomicBool) -> bool {
     let clock = Monotonic::new();
     let mut bus = SocketCan::open(interface, &Options::default(), clock).expect("it is up");
-    let mut bench = Bench::new(rig, None, 1).expect("servos are simulated");
+    let mut bench = SimulatedBench::new(rig, None, 1).expect("servos are simulated");
     let real_time = priority.map(|priority| threads::enter(&Wishes { priority, ..Wishes::default() }));
     assert!(real_time.as_ref().is_none_or(|granted| granted.refused().is_empty()), "{real_time:?}");
     while !over.load(Ordering::Relaxed) {

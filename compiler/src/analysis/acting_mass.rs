@@ -25,13 +25,13 @@ const INERTIA: Dimension = Dimension::of([1, 2, 0, 0, 0]);
 const FITS: std::ops::RangeInclusive<f64> = 0.5..=1.5;
 
 /// The quantities of a sampled contact.
-struct Contact {
+struct SampledContact {
     speed: VarId,
     force: VarId,
     mass: VarId,
 }
 
-fn contacts(system: &System, types: &Types) -> Vec<Contact> {
+fn contacts(system: &System, types: &Types) -> Vec<SampledContact> {
     let mut ports: Vec<[Option<VarId>; 3]> = vec![[None; 3]; system.instances.len()];
     for id in system.var_ids() {
         let var = system.var(id);
@@ -47,7 +47,7 @@ fn contacts(system: &System, types: &Types) -> Vec<Contact> {
         let [Some(force), Some(mass), Some(speed)] = ports else { return None };
         let held = matches!(system.var(force).definition, Definition::Held { .. });
         let fits = [MASS, INERTIA].contains(&types.units[mass.0 as usize].dimension);
-        (held && fits).then_some(Contact { speed, force, mass })
+        (held && fits).then_some(SampledContact { speed, force, mass })
     };
     ports.into_iter().filter_map(contact).collect()
 }
@@ -74,7 +74,7 @@ pub fn check(
 }
 
 fn said(
-    contact: &Contact,
+    contact: &SampledContact,
     system: &System,
     types: &Types,
     at: &Instance,

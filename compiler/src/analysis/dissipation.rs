@@ -60,13 +60,13 @@ const LARGEST_LOAD: f64 = 1e6;
 const CRAWL: f64 = 1e-15;
 
 /// The ports of a friction model on its own.
-struct Contact {
+struct ContactPorts {
     v: VarId,
     force: VarId,
     external: Option<VarId>,
 }
 
-fn contact(system: &System, types: &Types) -> Option<Contact> {
+fn contact(system: &System, types: &Types) -> Option<ContactPorts> {
     let port = |name: &str, kind: VarKind, dimension: Dimension| {
         system.var_ids().find(|id| {
             let var = system.var(*id);
@@ -77,11 +77,11 @@ fn contact(system: &System, types: &Types) -> Option<Contact> {
         })
     };
     let (v, force) = (port("v", VarKind::Input, VELOCITY)?, port("F", VarKind::Output, FORCE)?);
-    Some(Contact { v, force, external: port("F_ext", VarKind::Input, FORCE) })
+    Some(ContactPorts { v, force, external: port("F_ext", VarKind::Input, FORCE) })
 }
 
 /// Evaluates a model at points.
-struct Bench {
+struct PointEvaluator {
     program: Program,
     outputs: Rc<Func>,
     start: Rc<Func>,
@@ -99,8 +99,8 @@ struct Bench {
     block: Vec<f64>,
 }
 
-impl Bench {
-    fn new(system: &System, types: &Types, contact: &Contact) -> Option<Bench> {
+impl PointEvaluator {
+    fn new(system: &System, types: &Types, contact: &ContactPorts) -> Option<PointEvaluator> {
         // All open parameters and all other inputs must have values.
         let open = system.var_ids().any(|id| {
             let var = system.var(id);
@@ -142,7 +142,7 @@ impl Bench {
         let mut block = vec![0.0; program.description.layout.size()];
         block[program.description.layout.params.range()].copy_from_slice(&program.params);
         let energy = energy.first().copied();
-        Some(Bench { program, outputs, start, v, external, force, flow, energy, exits, matters, block })
+        Some(PointEvaluator { program, outputs, start, v, external, force, flow, energy, exits, matters, block })
     }
 
     fn run(&mut self, func: &Func) {
@@ -165,7 +165,7 @@ impl Bench {
 /// Warnings for a friction model; none for other models.
 pub fn check(system: &System, types: &Types, found: &mut Vec<Diagnostic>) {
     let Some(contact) = contact(system, types) else { return };
-    let Some(mut bench) = Bench::new(system, types, &contact) else { return };
+    let Some(mut bench) = PointEvaluator::new(system, types, &contact) else { return };
     let force = system.var(contact.force);
     let memory = !system.automata.is_empty()
         || system.vars.iter().any(|var| !matches!(var.definition, Definition::Value(..) | Definition::Free));
@@ -191,7 +191,7 @@ pub fn check(system: &System, types: &Types, found: &mut Vec<Diagnostic>) {
 }
 
 /// Reports a contact without stiction: the load that moves it, and the resulting speed.
-fn creep(system: &System, bench: &mut Bench, force: &Var, found: &mut Vec<Diagnostic>) {
+fn creep(system: &System, bench: &mut PointEvaluator, force: &Var, found: &mut Vec<Diagnostic>) {
     let coulomb = system
         .var_ids()
         .find(|id| system.var(*id).name == "Fc" && system.var(*id).instance == InstanceId(0))
@@ -233,11 +233,11 @@ fn decade(k: i32, n: i32) -> f64 {
 /// Whether a friction model on its own dissipates: F v − dV/dt ≥ 0, and F v ≥ min(0, F_ext v) with an external force.
 pub fn dissipation(system: &System, types: &Types) -> Option<Verdict> {
     let contact = contact(system, types)?;
-    let mut bench = Bench::new(system, types, &contact)?;
+    let mut bench = PointEvaluator::new(system, types, &contact)?;
     Some(dissipation_of(system, &contact, &mut bench))
 }
 
-fn dissipation_of(system: &System, contact: &Contact, bench: &mut Bench) -> Verdict {
+fn dissipation_of(system: &System, contact: &ContactPorts, bench: &mut PointEvaluator) -> Verdict {
     static KNOWN: Memo<Verdict> = Memo::new();
     let energy = system.storages.iter().any(|(owner, _)| *owner == InstanceId(0));
     let also = [contact.v.0, contact.force.0, contact.external.map_or(u32::MAX, |id| id.0), u32::from(energy)];
@@ -249,7 +249,7 @@ fn dissipation_of(system: &System, contact: &Contact, bench: &mut Bench) -> Verd
 }
 
 /// Tries to prove by intervals, in every regime and for both directions, what the samples did not refute.
-fn proved(system: &System, contact: &Contact, bench: &mut Bench) -> bool {
+fn proved(system: &System, contact: &ContactPorts, bench: &mut PointEvaluator) -> bool {
     let energy = system.storages.iter().any(|(owner, _)| *owner == InstanceId(0));
     let layout = bench.program.description.layout.clone();
     let description = bench.program.description.clone();
@@ -370,7 +370,7 @@ fn proved(system: &System, contact: &Contact, bench: &mut Bench) -> bool {
 }
 
 /// The verdict from samples.
-fn sampled(system: &System, contact: &Contact, bench: &mut Bench) -> Verdict {
+fn sampled(system: &System, contact: &ContactPorts, bench: &mut PointEvaluator) -> Verdict {
     let layout = bench.program.description.layout.clone();
     let n = layout.states.len as usize;
     let storage = system.storages.iter().find(|(owner, _)| *owner == InstanceId(0)).map(|(_, energy)| *energy);
@@ -492,7 +492,7 @@ fn energy_flow(program: &Program, energy: Slot) -> Option<Func> {
     Some(crate::math::expand(&build.finish()))
 }
 
-fn pushes(system: &System, types: &Types, force: &Var, bench: &Bench, point: &Counterexample) -> Diagnostic {
+fn pushes(system: &System, types: &Types, force: &Var, bench: &PointEvaluator, point: &Counterexample) -> Diagnostic {
     let states = system.var_ids().filter(|id| matches!(system.var(*id).definition, Definition::Continuous { .. }));
     let mut at = vec![format!("v = {} m/s", three_digits(point.v))];
     for (id, value) in states.zip(&point.states) {

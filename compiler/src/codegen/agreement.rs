@@ -78,15 +78,15 @@ fn outlined(func: &Func, lengths: Lengths) -> Cfg {
 /// ; pool: 1.0, 2.0                 the pool, if it reads one
 /// ; slot 3: 0.5, edges             numbers of a slot: each is combined with those of all others; `edges` are special numbers
 /// ```
-struct Case {
+struct AgreementCase {
     func: Func,
     layout: Layout,
     pool: Vec<f64>,
     blocks: Vec<Vec<f64>>,
 }
 
-impl Case {
-    fn read(text: &str) -> Case {
+impl AgreementCase {
+    fn read(text: &str) -> AgreementCase {
         let numbers = |list: &str| -> Vec<f64> {
             let number = |word: &str| match word {
                 "edges" => REALS.to_vec(),
@@ -116,7 +116,7 @@ impl Case {
                 _ => {}
             }
         }
-        Case { func: parse(text).unwrap_or_else(|error| panic!("{error}\n{text}")), layout, pool, blocks }
+        AgreementCase { func: parse(text).unwrap_or_else(|error| panic!("{error}\n{text}")), layout, pool, blocks }
     }
 }
 
@@ -128,7 +128,8 @@ fn functions_of_files_agree() {
     let (mut files, mut steps) = (0, 0);
     for path in std::fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()) {
         let name = path.display().to_string();
-        let Case { func, layout, pool, blocks } = Case::read(&std::fs::read_to_string(&path).unwrap());
+        let AgreementCase { func, layout, pool, blocks } =
+            AgreementCase::read(&std::fs::read_to_string(&path).unwrap());
         for count in [1, 3, 40] {
             check(&func, &layout, &blocks, &pool, count, &format!("{name}, {count} iterations"));
         }
@@ -173,7 +174,7 @@ fn four_springs_are_unswitched() {
         include_str!("../../../tests/ir/agreement/springs_1.ir"),
         include_str!("../../../tests/ir/agreement/springs_4.ir"),
     ];
-    let found = texts.map(|text| unswitchable(&Case::read(text).func).is_some());
+    let found = texts.map(|text| unswitchable(&AgreementCase::read(text).func).is_some());
     assert_eq!(found, [false, true]);
 }
 

@@ -6,7 +6,7 @@
 //! them, because there are only 16 registers.
 
 use crate::codegen::emit::signature;
-use crate::codegen::loop_plan::{Line, LoopPlan, plan};
+use crate::codegen::loop_plan::{LoopPlan, StraightLine, plan};
 use crate::codegen::unsupported::Unsupported;
 use crate::hash::{HashMap, HashSet};
 use crate::ir::scc::topological_order;
@@ -40,7 +40,7 @@ pub fn emit(
         return Err(Unsupported("a ring of samples (delay) has no lanes".into()));
     }
     let types = verify::types(func).expect("the function is sound");
-    let step = Step { func, types, vectors, plan: plan(func, layout.size(), vectors * BYTES) };
+    let step = VectorStep { func, types, vectors, plan: plan(func, layout.size(), vectors * BYTES) };
     let plan = &step.plan;
     target.signature = signature(isa);
     target.signature.params.push(AbiParam::new(types::I64));
@@ -73,8 +73,8 @@ pub fn emit(
     line.write(&plan.prologue, &[], |value| step.hoisted_place(value).into_iter().collect());
     for index in 0..plan.carried.len() {
         for k in 0..vectors {
-            let number = line.load(types::F64X2, Place::Block(plan.carried[index].0), k);
-            line.store(number, Place::Area(0, index), k);
+            let number = line.load(types::F64X2, VectorPlace::Block(plan.carried[index].0), k);
+            line.store(number, VectorPlace::Area(0, index), k);
         }
     }
     let areas = [0, 1].map(|area| line.b.ins().iadd_imm_s(block, plan.areas[area] as i64));
@@ -97,7 +97,7 @@ pub fn emit(
     let carried: Vec<Value> = plan.carried.iter().map(|(_, value)| *value).collect();
     line.write(&plan.body, &carried, |value| {
         let of = plan.carried.iter().enumerate().filter(|(_, (_, next))| *next == value);
-        of.map(|(index, _)| Place::After(index)).collect()
+        of.map(|(index, _)| VectorPlace::After(index)).collect()
     });
     match func.failed() {
         None => line.b.ins().jump(next, &[]),
@@ -122,8 +122,8 @@ pub fn emit(
     let results: Vec<Value> = func.stores.iter().map(|(_, value)| *value).chain(func.status).collect();
     line.write(&plan.last, &results, |value| {
         let stores = func.stores.iter().filter(|(_, stored)| *stored == value);
-        let mut places: Vec<Place> = stores.map(|(slot, _)| Place::Block(*slot)).collect();
-        places.extend((func.status == Some(value)).then_some(Place::Statuses));
+        let mut places: Vec<VectorPlace> = stores.map(|(slot, _)| VectorPlace::Block(*slot)).collect();
+        places.extend((func.status == Some(value)).then_some(VectorPlace::Statuses));
         places
     });
     let done = line.b.ins().iadd_imm_s(done, 1);
@@ -133,7 +133,7 @@ pub fn emit(
     line.b.switch_to_block(constants);
     for (number, bits) in line.constants.clone().into_iter().enumerate() {
         let constant = line.constant(types::I64X2, bits);
-        line.store(constant, Place::Constant(number), 0);
+        line.store(constant, VectorPlace::Constant(number), 0);
     }
     line.b.ins().jump(prepare, &[]);
     let size = plan.end + line.constants.len() * BYTES;
@@ -147,7 +147,7 @@ pub fn emit(
 
 /// The place of a group of vectors in memory.
 #[derive(Clone, Copy)]
-enum Place {
+enum VectorPlace {
     /// A slot of the block.
     Block(Slot),
     /// A carried slot in the first or second area: area, index.
@@ -164,16 +164,16 @@ enum Place {
 }
 
 /// A step with the plan of its loop.
-struct Step<'a> {
+struct VectorStep<'a> {
     func: &'a Func,
     types: Vec<Type>,
     vectors: usize,
     plan: LoopPlan<Value>,
 }
 
-impl Step<'_> {
-    fn hoisted_place(&self, value: Value) -> Option<Place> {
-        self.plan.hoisted.iter().position(|known| *known == value).map(Place::Hoisted)
+impl VectorStep<'_> {
+    fn hoisted_place(&self, value: Value) -> Option<VectorPlace> {
+        self.plan.hoisted.iter().position(|known| *known == value).map(VectorPlace::Hoisted)
     }
 }
 
@@ -207,7 +207,7 @@ fn operands(func: &Func, value: Value) -> Vec<Value> {
     operands
 }
 
-impl Line for Func {
+impl StraightLine for Func {
     type Node = Value;
 
     fn count(&self) -> usize {
@@ -254,7 +254,7 @@ impl Line for Func {
 
 /// A straight line that is being emitted.
 struct Emitter<'a> {
-    step: &'a Step<'a>,
+    step: &'a VectorStep<'a>,
     plan: &'a LoopPlan<Value>,
     b: FunctionBuilder<'a>,
     block: clif::Value,
@@ -281,7 +281,7 @@ fn vector_of(of: Type) -> clif::Type {
 impl Emitter<'_> {
     /// Emits operations; `places` says where a value is to be stored as soon as it is computed. Values of `stored_last`
     /// that are not among the operations are stored at the end.
-    fn write(&mut self, order: &[Value], stored_last: &[Value], places: impl Fn(Value) -> Vec<Place>) {
+    fn write(&mut self, order: &[Value], stored_last: &[Value], places: impl Fn(Value) -> Vec<VectorPlace>) {
         for value in order {
             for k in 0..self.step.vectors {
                 let result = self.operation(*value, k);
@@ -303,27 +303,27 @@ impl Emitter<'_> {
     }
 
     /// Base address and offset of a vector.
-    fn address(&self, place: Place, k: usize) -> (clif::Value, i32) {
+    fn address(&self, place: VectorPlace, k: usize) -> (clif::Value, i32) {
         let group = |index: usize| (index * self.step.vectors + k) * BYTES;
         let (base, offset) = match place {
-            Place::Block(slot) => (self.block, group(slot.index())),
-            Place::Area(area, index) => (self.block, self.plan.areas[area] + group(index)),
-            Place::Before(index) => (self.before, group(index)),
-            Place::After(index) => (self.after, group(index)),
-            Place::Hoisted(index) => (self.block, self.plan.hoisted_at + group(index)),
-            Place::Constant(number) => (self.block, self.plan.end + number * BYTES),
-            Place::Statuses => (self.statuses, group(0)),
+            VectorPlace::Block(slot) => (self.block, group(slot.index())),
+            VectorPlace::Area(area, index) => (self.block, self.plan.areas[area] + group(index)),
+            VectorPlace::Before(index) => (self.before, group(index)),
+            VectorPlace::After(index) => (self.after, group(index)),
+            VectorPlace::Hoisted(index) => (self.block, self.plan.hoisted_at + group(index)),
+            VectorPlace::Constant(number) => (self.block, self.plan.end + number * BYTES),
+            VectorPlace::Statuses => (self.statuses, group(0)),
         };
         // Larger code is refused at the end of `emit`.
         (base, offset as i32)
     }
 
-    fn load(&mut self, of: clif::Type, place: Place, k: usize) -> clif::Value {
+    fn load(&mut self, of: clif::Type, place: VectorPlace, k: usize) -> clif::Value {
         let (base, offset) = self.address(place, k);
         self.b.ins().load(of, MemFlagsData::trusted(), base, offset)
     }
 
-    fn store(&mut self, value: clif::Value, place: Place, k: usize) {
+    fn store(&mut self, value: clif::Value, place: VectorPlace, k: usize) {
         let (base, offset) = self.address(place, k);
         self.b.ins().store(MemFlagsData::trusted(), value, base, offset);
     }
@@ -345,7 +345,7 @@ impl Emitter<'_> {
             self.constants.push(bits);
             self.constants.len() - 1
         });
-        self.load(of, Place::Constant(number), 0)
+        self.load(of, VectorPlace::Constant(number), 0)
     }
 
     fn get(&mut self, value: Value, k: usize) -> clif::Value {
@@ -359,7 +359,7 @@ impl Emitter<'_> {
             Op::Bool(truth) => self.constant_operand(of, if truth { u64::MAX } else { 0 }),
             Op::Load(slot) => {
                 let carried = self.plan.carried.iter().position(|(known, _)| *known == slot);
-                self.load(of, carried.map_or(Place::Block(slot), Place::Before), k)
+                self.load(of, carried.map_or(VectorPlace::Block(slot), VectorPlace::Before), k)
             }
             op => {
                 let place = self.step.hoisted_place(value).unwrap_or_else(|| panic!("{op:?} has not been computed"));

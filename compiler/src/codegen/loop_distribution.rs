@@ -83,13 +83,13 @@ fn split(func: &Func, size: usize) -> Option<(Leading, Func)> {
         Some(k) => layout.params.slot(k),
         None => slot,
     };
-    let mut first = Part::new("once", func);
+    let mut first = LoopPart::new("once", func);
     for value in ops(&in_invariants) {
         first.copy(value, &own_slot);
     }
     invariants.iter().enumerate().for_each(|(k, value)| first.store(layout.states.slot(k), *value, &types));
 
-    let mut leading = Part::new("instants", func);
+    let mut leading = LoopPart::new("instants", func);
     for value in ops(&in_leading) {
         match invariants.iter().position(|known| *known == value) {
             Some(k) => leading.load(layout.states.slot(k), value, &types),
@@ -98,7 +98,7 @@ fn split(func: &Func, size: usize) -> Option<(Leading, Func)> {
     }
     passed.iter().enumerate().for_each(|(k, value)| leading.store(layout.outputs.slot(k), *value, &types));
 
-    let mut remaining = Part::new(&func.name, func);
+    let mut remaining = LoopPart::new(&func.name, func);
     for value in ops(&vec![true; func.ops.len()]) {
         match passed.iter().position(|known| *known == value) {
             Some(k) => remaining.load(Slot((size + k) as u32), value, &types),
@@ -166,17 +166,17 @@ fn passed(func: &Func, on: &[Variance], types: &[Type]) -> Vec<Value> {
 }
 
 /// A part of a function that is being built.
-struct Part<'a> {
+struct LoopPart<'a> {
     of: &'a Func,
     func: Func,
     /// For each value of the function, its value in this part.
     values: Vec<Value>,
 }
 
-impl<'a> Part<'a> {
-    fn new(name: &str, of: &'a Func) -> Part<'a> {
+impl<'a> LoopPart<'a> {
+    fn new(name: &str, of: &'a Func) -> LoopPart<'a> {
         let func = Func { name: name.into(), ..Func::default() };
-        Part { of, func, values: vec![Value(u32::MAX); of.ops.len()] }
+        LoopPart { of, func, values: vec![Value(u32::MAX); of.ops.len()] }
     }
 
     fn push(&mut self, op: Op) -> Value {

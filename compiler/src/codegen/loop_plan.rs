@@ -18,7 +18,7 @@ use abi::Slot;
 use std::hash::Hash;
 
 /// A straight line of nodes in topological order.
-pub trait Line {
+pub trait StraightLine {
     /// Stands for the result of a node.
     type Node: Copy + Eq + Hash;
     /// Number of nodes.
@@ -62,7 +62,7 @@ pub struct LoopPlan<N> {
 }
 
 /// Plans the loop over a step. `size`: slots of the block. `vectors`: bytes of all vectors of one value.
-pub fn plan<L: Line>(line: &L, size: usize, vectors: usize) -> LoopPlan<L::Node> {
+pub fn plan<L: StraightLine>(line: &L, size: usize, vectors: usize) -> LoopPlan<L::Node> {
     let loaded: HashSet<Slot> = (0..line.count()).filter_map(|i| line.load(i)).collect();
     let carried: Vec<(Slot, L::Node)> =
         line.stores().iter().copied().filter(|(slot, _)| loaded.contains(slot)).collect();

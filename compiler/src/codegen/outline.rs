@@ -60,7 +60,7 @@ pub fn outline(cfg: &mut Cfg, lengths: Lengths) {
     let variance = variance(&func, None);
     // Loop invariants occupy their scratch slots through the whole call. If there are too many, each iteration computes
     // them.
-    let divided = |once| Line::new(&func, &variance, once).outline(lengths);
+    let divided = |once| OrderedOps::new(&func, &variance, once).outline(lengths);
     if let Some(outlined) = [true, false].into_iter().map(divided).find(|cut| cut.scratch_len <= lengths.max_scratch) {
         *cfg = Writer::new(&func, &outlined).write();
     }
@@ -326,15 +326,15 @@ fn is_rematerialised(func: &Func, value: Value) -> bool {
 }
 
 /// The operations of a function in the order in which the pieces compute them.
-struct Line<'a> {
+struct OrderedOps<'a> {
     func: &'a Func,
     invariant: Vec<Value>,
     iteration: Vec<Value>,
     failure: Vec<Value>,
 }
 
-impl<'a> Line<'a> {
-    fn new(func: &'a Func, variance: &[Variance], once: bool) -> Line<'a> {
+impl<'a> OrderedOps<'a> {
+    fn new(func: &'a Func, variance: &[Variance], once: bool) -> OrderedOps<'a> {
         let cold = cold(func);
         let stored: HashMap<Slot, Value> = func.stores.iter().copied().collect();
         // Loads that cannot be rematerialised, because the failure pieces read them after their slot may have been
@@ -368,7 +368,7 @@ impl<'a> Line<'a> {
         }
         detail.into_iter().for_each(|detail| order.visit(detail, None));
         let failure = order.take().filter(own).collect();
-        Line { func, invariant, iteration, failure }
+        OrderedOps { func, invariant, iteration, failure }
     }
 
     fn outline(&self, lengths: Lengths) -> Outlined {

@@ -15,7 +15,7 @@ use crate::{math, numerics};
 use abi::plan::Method;
 
 /// The report of one pass over the step of a program.
-pub struct Ran {
+pub struct PassRun {
     /// The name of the pass.
     pub name: &'static str,
     /// A description of the pass.
@@ -27,8 +27,8 @@ pub struct Ran {
 }
 
 /// Runs the passes on the step of a method and calls `ran` after each.
-pub fn each(program: &Program, method: Method, ran: &mut dyn FnMut(Ran)) {
-    let plain = |name, does, before, after| Ran { name, does, ops: [before, after], blocks: None };
+pub fn each(program: &Program, method: Method, ran: &mut dyn FnMut(PassRun)) {
+    let plain = |name, does, before, after| PassRun { name, does, ops: [before, after], blocks: None };
     let func = match method {
         Method::Adaptive => match tiering::of_lanes(program, method) {
             Some((_, step)) => {
@@ -72,6 +72,6 @@ pub fn each(program: &Program, method: Method, ran: &mut dyn FnMut(Ran)) {
             Some((ops, blocks)) => (ops, Some(blocks)),
             None => ([graphs[0].1.len(); 2], None),
         };
-        ran(Ran { name: pass.name, does: pass.does, ops, blocks });
+        ran(PassRun { name: pass.name, does: pass.does, ops, blocks });
     }
 }

@@ -103,13 +103,13 @@ struct Automaton {
     /// Its values that other operations or results read.
     outputs: Vec<Value>,
     /// For each mode, the bits of its number and its residual operations.
-    cases: Vec<(u64, Case)>,
+    cases: Vec<(u64, ModeCase)>,
     /// The operations for any other number in the slot, not specialised.
-    general: Case,
+    general: ModeCase,
 }
 
 /// Residual operations for one mode and how they end.
-struct Case {
+struct ModeCase {
     /// Operations in topological order.
     list: Vec<Value>,
     /// How the case ends.
@@ -121,12 +121,12 @@ enum CaseEnd {
     /// The value of each output of the automaton.
     Outputs(Vec<Value>),
     /// A branch on a boolean that many operations depend on: the case where it is true, and the case where it is false.
-    Branch(Value, Box<[Case; 2]>),
+    Branch(Value, Box<[ModeCase; 2]>),
 }
 
-impl Case {
+impl ModeCase {
     /// Visits the case and all nested cases.
-    fn each(&self, each: &mut impl FnMut(&Case)) {
+    fn each(&self, each: &mut impl FnMut(&ModeCase)) {
         each(self);
         if let CaseEnd::Branch(_, sides) = &self.end {
             sides.iter().for_each(|side| side.each(each));
@@ -153,7 +153,7 @@ enum Group {
     Joint,
     /// Rematerialised in each mode that needs it.
     Rematerialised,
-    /// Not here: it is cold.
+    /// In the cold block of the function.
     Cold,
 }
 
@@ -312,7 +312,7 @@ impl Writer<'_> {
             held: held.map(|bits| (automaton.slot, bits)),
         };
         // A mode that is left in the same step is rarely active, so it is tested last.
-        let mut cases: Vec<(u64, &Case)> = automaton.cases.iter().map(|(bits, case)| (*bits, case)).collect();
+        let mut cases: Vec<(u64, &ModeCase)> = automaton.cases.iter().map(|(bits, case)| (*bits, case)).collect();
         cases.sort_by_key(|(bits, case)| self.changes(case, &join(Some(*bits))));
         let from = self.at;
         let mut blocks = Vec::new();
@@ -327,7 +327,7 @@ impl Writer<'_> {
     }
 
     /// Whether a case without further branches ends with another mode than the one it began with.
-    fn changes(&self, case: &Case, join: &Join) -> bool {
+    fn changes(&self, case: &ModeCase, join: &Join) -> bool {
         let CaseEnd::Outputs(outputs) = &case.end else { return false };
         join.stores.iter().any(|(slot, number)| {
             let held = join.held.filter(|(held, _)| held == slot);
@@ -337,7 +337,7 @@ impl Writer<'_> {
     }
 
     /// Writes a case into a new block, a cold one if it changes the mode.
-    fn side(&mut self, case: &Case, join: &Join) -> BlockId {
+    fn side(&mut self, case: &ModeCase, join: &Join) -> BlockId {
         let part = if self.changes(case, join) { Part::Cold } else { Part::Body };
         let block = self.cfg.empty(part);
         self.case(case, block, join);
@@ -345,7 +345,7 @@ impl Writer<'_> {
     }
 
     /// Writes one case and the jump to the join.
-    fn case(&mut self, case: &Case, block: BlockId, join: &Join) {
+    fn case(&mut self, case: &ModeCase, block: BlockId, join: &Join) {
         self.at = block;
         // A case computes the values of its automaton itself; they are not stored yet.
         let stored = std::mem::take(&mut self.stored);
@@ -438,7 +438,8 @@ fn specialise(func: &Func, modes: &Modes, cold: &[bool], guard: Option<Value>) -
             let case =
                 |bits: &u64| (*bits, case(&mut build, &mut available, (*load, *bits), &members, (&outputs, next)));
             let cases = modes.iter().map(case).collect();
-            let general = Case { list: slice(&build, &available, &outputs), end: CaseEnd::Outputs(outputs.clone()) };
+            let general =
+                ModeCase { list: slice(&build, &available, &outputs), end: CaseEnd::Outputs(outputs.clone()) };
             Automaton { slot, outputs, cases, general }
         })
         .collect();
@@ -537,8 +538,8 @@ fn rematerialise_cheap(func: &Func, places: &mut [Group]) {
     }
 }
 
-/// Moves operations that only guards need to the end, after all automata, if stored values are the only mode-dependent
-/// values that they read: they are the same in each mode.
+/// Moves operations of guards after all automata where the only mode-dependent values that they read are stored ones. The
+/// operations are then the same in each mode.
 fn move_guards_after(func: &Func, guard: Option<Value>, places: &mut [Group]) {
     let mut stored = vec![false; func.ops.len()];
     func.stores.iter().for_each(|(_, value)| stored[value.index()] = true);
@@ -575,7 +576,7 @@ fn case(
     (load, bits): (Value, u64),
     members: &[Value],
     (outputs, next): (&[Value], Option<usize>),
-) -> Case {
+) -> ModeCase {
     let held = build.op(Op::Real(bits));
     let outputs = partial_eval(build, members, &[(load, held)], outputs);
     split_case(build, available, outputs, next.map(|next| (next, held)), 0)
@@ -589,10 +590,10 @@ fn split_case(
     outputs: Vec<Value>,
     next: Option<(usize, Value)>,
     depth: usize,
-) -> Case {
+) -> ModeCase {
     let list = slice(build, available, &outputs);
     if depth == MAX_DEPTH || list.len() > MAX_SPLIT_OPS {
-        return Case { list, end: CaseEnd::Outputs(outputs) };
+        return ModeCase { list, end: CaseEnd::Outputs(outputs) };
     }
     let frequent = most_tested(build, &list).filter(|_| list.len() >= MIN_SPLIT_OPS);
     let changes_mode = next.and_then(|(next, held)| match build.get(outputs[next]) {
@@ -614,14 +615,14 @@ fn split_case(
         };
         let case = (changes_mode == Some(condition) || shorter(build, available)).then(|| {
             let sides = sides.map(|outputs| split_case(build, available, outputs, next, depth + 1));
-            Case { list: first.clone(), end: CaseEnd::Branch(condition, Box::new(sides)) }
+            ModeCase { list: first.clone(), end: CaseEnd::Branch(condition, Box::new(sides)) }
         });
         first.iter().for_each(|value| _ = available.remove(value));
         if let Some(case) = case {
             return case;
         }
     }
-    Case { list, end: CaseEnd::Outputs(outputs) }
+    ModeCase { list, end: CaseEnd::Outputs(outputs) }
 }
 
 /// The boolean that most operations of a list read, if more than one does; the first of several.
@@ -668,7 +669,7 @@ mod tests {
         let specialised = specialise(&func, &Modes::default(), &vec![false; func.ops.len()], None);
         let [automaton] = &specialised.automata[..] else { panic!("one automaton") };
         assert_eq!((automaton.slot, &specialised.joint[..]), (Slot(4), &[][..]));
-        let shown = |case: &Case| -> Vec<String> {
+        let shown = |case: &ModeCase| -> Vec<String> {
             case.list
                 .iter()
                 .map(|value| specialised.func.op(*value).to_string())

@@ -111,7 +111,7 @@ impl Term {
 
 /// The type of a node or quantity.
 #[derive(Clone, PartialEq, Debug)]
-enum Kind {
+enum NodeType {
     Boolean,
     Real(Term),
     /// Has been reported; matches every type.
@@ -128,19 +128,19 @@ struct Checker<'a> {
     diagnostics: &'a mut Vec<Diagnostic>,
     /// The substitution: the term of each unknown solved so far.
     unknowns: Vec<Option<Term>>,
-    types: Vec<Kind>,
-    vars: Vec<Kind>,
+    types: Vec<NodeType>,
+    vars: Vec<NodeType>,
 }
 
 impl Checker<'_> {
     /// E0105: an exponent of an inferred dimension too large to be represented.
-    fn within_reason(&mut self, id: ExprId, found: Kind) -> Kind {
+    fn within_reason(&mut self, id: ExprId, found: NodeType) -> NodeType {
         let beyond = |term: &Term| term.base.is_beyond() || term.unknowns.iter().any(|(_, e)| e.is_beyond());
-        if !matches!(&found, Kind::Real(term) if beyond(term)) {
+        if !matches!(&found, NodeType::Real(term) if beyond(term)) {
             return found;
         }
         self.diagnostics.push(too_large("the exponents of the unit of this are beyond reason", self.system.span(id)));
-        Kind::Unknown
+        NodeType::Unknown
     }
 
     fn fresh(&mut self) -> Term {
@@ -179,15 +179,15 @@ impl Checker<'_> {
         }
     }
 
-    fn kind(&self, id: ExprId) -> &Kind {
+    fn kind(&self, id: ExprId) -> &NodeType {
         &self.types[id.0 as usize]
     }
 
     fn real(&mut self, id: ExprId) -> Option<Term> {
         match self.kind(id).clone() {
-            Kind::Real(term) => Some(term),
-            Kind::Unknown => None,
-            Kind::Boolean => {
+            NodeType::Real(term) => Some(term),
+            NodeType::Unknown => None,
+            NodeType::Boolean => {
                 let error = Diagnostic::error("E0101", "a condition cannot be used as a quantity")
                     .label(self.system.span(id), "true or false")
                     .help("write `if … then 1 else 0`");
@@ -230,11 +230,11 @@ impl Checker<'_> {
         let boolean = boolean_vars(self.system);
         for (var, boolean) in self.system.vars.iter().zip(boolean) {
             let kind = match (&var.unit, var.kind) {
-                _ if var.unreadable || self.strangers.contains(&var.instance) => Kind::Unknown,
-                (Some((unit, _)), _) => Kind::Real(Term::known(unit.dimension)),
-                _ if boolean => Kind::Boolean,
+                _ if var.unreadable || self.strangers.contains(&var.instance) => NodeType::Unknown,
+                (Some((unit, _)), _) => NodeType::Real(Term::known(unit.dimension)),
+                _ if boolean => NodeType::Boolean,
                 (None, VarKind::Param) if var.shown.is_some() => {
-                    Kind::Real(Term::known(var.shown.as_ref().map_or(Dimension::NONE, |unit| unit.dimension)))
+                    NodeType::Real(Term::known(var.shown.as_ref().map_or(Dimension::NONE, |unit| unit.dimension)))
                 }
                 (None, VarKind::Input) => {
                     let error = Diagnostic::error("E0106", format!("input `{}` does not say its unit", var.name))
@@ -243,9 +243,9 @@ impl Checker<'_> {
                         "write `input {0} [m/s]`, with the unit that is meant; `input {0} [1]` for a pure number",
                         var.name
                     )));
-                    Kind::Unknown
+                    NodeType::Unknown
                 }
-                (None, _) => Kind::Real(self.fresh()),
+                (None, _) => NodeType::Real(self.fresh()),
             };
             self.vars.push(kind);
         }
@@ -253,16 +253,16 @@ impl Checker<'_> {
 
     // ---- nodes
 
-    fn node(&mut self, id: ExprId) -> Kind {
-        let number = Kind::Real(Term::known(Dimension::NONE));
+    fn node(&mut self, id: ExprId) -> NodeType {
+        let number = NodeType::Real(Term::known(Dimension::NONE));
         match self.system.node(id).clone() {
-            Node::Number { dimension: Some(dimension), .. } => Kind::Real(Term::known(dimension)),
-            Node::Number { dimension: None, .. } | Node::Hole => Kind::Real(self.fresh()),
-            Node::Bool(_) | Node::InRegime(..) => Kind::Boolean,
-            Node::Time => Kind::Real(Term::known(TIME)),
+            Node::Number { dimension: Some(dimension), .. } => NodeType::Real(Term::known(dimension)),
+            Node::Number { dimension: None, .. } | Node::Hole => NodeType::Real(self.fresh()),
+            Node::Bool(_) | Node::InRegime(..) => NodeType::Boolean,
+            Node::Time => NodeType::Real(Term::known(TIME)),
             Node::Var(var) => self.vars[var.0 as usize].clone(),
             Node::Rate(var) => match &self.vars[var.0 as usize] {
-                Kind::Real(term) => Kind::Real(term.times(&Term::known(RATE), Ratio::ONE)),
+                NodeType::Real(term) => NodeType::Real(term.times(&Term::known(RATE), Ratio::ONE)),
                 other => other.clone(),
             },
             Node::PathRate(var) => {
@@ -272,40 +272,40 @@ impl Checker<'_> {
                         .label(self.system.span(id), "no such derivative")
                         .help(format!("write `d{name}/dt`"));
                     self.diagnostics.push(error);
-                    return Kind::Unknown;
+                    return NodeType::Unknown;
                 };
                 match (&self.vars[var.0 as usize], &self.vars[path.0 as usize]) {
-                    (Kind::Real(x), Kind::Real(s)) => Kind::Real(x.times(s, Ratio::whole(-1))),
-                    _ => Kind::Unknown,
+                    (NodeType::Real(x), NodeType::Real(s)) => NodeType::Real(x.times(s, Ratio::whole(-1))),
+                    _ => NodeType::Unknown,
                 }
             }
-            Node::Negate(a) => self.real(a).map_or(Kind::Unknown, Kind::Real),
+            Node::Negate(a) => self.real(a).map_or(NodeType::Unknown, NodeType::Real),
             Node::Not(a) => {
                 self.condition(a, "`not`");
-                Kind::Boolean
+                NodeType::Boolean
             }
             Node::Binary(op, a, b) => self.binary(op, a, b),
             Node::If(c, a, b) => {
                 self.condition(c, "`if`");
                 match (self.kind(a).clone(), self.kind(b).clone()) {
-                    (Kind::Boolean, Kind::Boolean) => Kind::Boolean,
-                    (Kind::Real(x), Kind::Real(y)) => {
+                    (NodeType::Boolean, NodeType::Boolean) => NodeType::Boolean,
+                    (NodeType::Real(x), NodeType::Real(y)) => {
                         if !self.unify(&x, &y) {
                             let message =
                                 format!("one branch is {}, the other {}", self.described(&x), self.described(&y));
                             self.differ("E0101", message, a, &x, b, &y);
-                            return Kind::Unknown;
+                            return NodeType::Unknown;
                         }
-                        Kind::Real(if x.unknowns.is_empty() { x } else { y })
+                        NodeType::Real(if x.unknowns.is_empty() { x } else { y })
                     }
-                    (Kind::Boolean, Kind::Real(_)) | (Kind::Real(_), Kind::Boolean) => {
+                    (NodeType::Boolean, NodeType::Real(_)) | (NodeType::Real(_), NodeType::Boolean) => {
                         let error = Diagnostic::error("E0101", "one branch is a condition, the other a quantity")
                             .label(self.system.span(a), "one")
                             .label(self.system.span(b), "the other");
                         self.diagnostics.push(error);
-                        Kind::Unknown
+                        NodeType::Unknown
                     }
-                    _ => Kind::Unknown,
+                    _ => NodeType::Unknown,
                 }
             }
             Node::Call(builtin, args) => self.call(builtin, &args),
@@ -324,10 +324,10 @@ impl Checker<'_> {
                     let error = Diagnostic::error("E0101", message).label(self.system.span(x), self.shown(&term));
                     self.diagnostics.push(error);
                 }
-                Kind::Real(result)
+                NodeType::Real(result)
             }
             // The difference is an earlier node and has been checked as a subtraction.
-            Node::Crossing(_) => Kind::Boolean,
+            Node::Crossing(_) => NodeType::Boolean,
             Node::Fits { value, dimension, role } => self.fits(value, dimension, &role),
             Node::Measure(measure, value, second, window) => {
                 for edge in [window.after, window.before].into_iter().flatten() {
@@ -344,7 +344,7 @@ impl Checker<'_> {
                     _ => None,
                 };
                 let Some(term) = (match (event, self.kind(value).clone()) {
-                    (_, Kind::Boolean) | (Some(_), _) => {
+                    (_, NodeType::Boolean) | (Some(_), _) => {
                         if let Some(event) = event {
                             self.condition(value, event);
                         }
@@ -352,7 +352,7 @@ impl Checker<'_> {
                     }
                     _ => self.real(value),
                 }) else {
-                    return Kind::Unknown;
+                    return NodeType::Unknown;
                 };
                 if let Some(second) = second
                     && let Some(given) = self.real(second)
@@ -367,7 +367,7 @@ impl Checker<'_> {
                     }
                 }
                 match measure {
-                    MeasureName::Integral => Kind::Real(term.times(&Term::known(TIME), Ratio::ONE)),
+                    MeasureName::Integral => NodeType::Real(term.times(&Term::known(TIME), Ratio::ONE)),
                     MeasureName::Crossings
                     | MeasureName::Count
                     | MeasureName::CountRises
@@ -379,11 +379,11 @@ impl Checker<'_> {
                     | MeasureName::First
                     | MeasureName::Rises
                     | MeasureName::Turns
-                    | MeasureName::Time => Kind::Real(Term::known(TIME)),
-                    _ => Kind::Real(term),
+                    | MeasureName::Time => NodeType::Real(Term::known(TIME)),
+                    _ => NodeType::Real(term),
                 }
             }
-            Node::Error => Kind::Unknown,
+            Node::Error => NodeType::Unknown,
         }
     }
 
@@ -507,7 +507,7 @@ impl Checker<'_> {
         match (&var.unit, &var.definition) {
             (Some((unit, _)), _) => Some(unit.dimension),
             (None, Definition::Value(value, _)) => match self.types.get(value.0 as usize) {
-                Some(Kind::Real(term)) => Some(self.resolved(term).base),
+                Some(NodeType::Real(term)) => Some(self.resolved(term).base),
                 _ => match self.system.node(*value) {
                     Node::Number { dimension, .. } => *dimension,
                     _ => None,
@@ -536,7 +536,7 @@ impl Checker<'_> {
     }
 
     fn condition(&mut self, id: ExprId, what: &str) {
-        if let Kind::Real(term) = self.kind(id).clone() {
+        if let NodeType::Real(term) = self.kind(id).clone() {
             let error = Diagnostic::error("E0101", format!("{what} needs a condition, not {}", self.described(&term)))
                 .label(self.system.span(id), "neither true nor false")
                 .help("compare it with something: `a > b`");
@@ -544,33 +544,33 @@ impl Checker<'_> {
         }
     }
 
-    fn binary(&mut self, op: BinaryOp, a: ExprId, b: ExprId) -> Kind {
+    fn binary(&mut self, op: BinaryOp, a: ExprId, b: ExprId) -> NodeType {
         match op {
             BinaryOp::And | BinaryOp::Or => {
                 let what = format!("`{}`", op.text());
                 self.condition(a, &what);
                 self.condition(b, &what);
-                return Kind::Boolean;
+                return NodeType::Boolean;
             }
             BinaryOp::Equal | BinaryOp::NotEqual
-                if *self.kind(a) == Kind::Boolean && *self.kind(b) == Kind::Boolean =>
+                if *self.kind(a) == NodeType::Boolean && *self.kind(b) == NodeType::Boolean =>
             {
-                return Kind::Boolean;
+                return NodeType::Boolean;
             }
             _ => {}
         }
         let (x, y) = (self.real(a), self.real(b));
         let comparison =
             !matches!(op, BinaryOp::Add | BinaryOp::Subtract | BinaryOp::Multiply | BinaryOp::Divide | BinaryOp::Power);
-        let (Some(x), Some(y)) = (x, y) else { return if comparison { Kind::Boolean } else { Kind::Unknown } };
+        let (Some(x), Some(y)) = (x, y) else { return if comparison { NodeType::Boolean } else { NodeType::Unknown } };
         match op {
-            BinaryOp::Multiply => Kind::Real(x.times(&y, Ratio::ONE)),
-            BinaryOp::Divide => Kind::Real(x.times(&y, Ratio::whole(-1))),
+            BinaryOp::Multiply => NodeType::Real(x.times(&y, Ratio::ONE)),
+            BinaryOp::Divide => NodeType::Real(x.times(&y, Ratio::whole(-1))),
             BinaryOp::Power => self.power(a, &x, b, &y),
             BinaryOp::Add | BinaryOp::Subtract => {
                 if self.unify(&x, &y) {
                     self.angles(a, b);
-                    return Kind::Real(if x.unknowns.is_empty() { x } else { y });
+                    return NodeType::Real(if x.unknowns.is_empty() { x } else { y });
                 }
                 let message = if op == BinaryOp::Add {
                     format!("cannot add {} and {}", self.described(&x), self.described(&y))
@@ -578,7 +578,7 @@ impl Checker<'_> {
                     format!("cannot subtract {} from {}", self.described(&y), self.described(&x))
                 };
                 self.differ("E0101", message, a, &x, b, &y);
-                Kind::Unknown
+                NodeType::Unknown
             }
             _ => {
                 if !self.unify(&x, &y) {
@@ -587,30 +587,30 @@ impl Checker<'_> {
                 } else {
                     self.angles(a, b);
                 }
-                Kind::Boolean
+                NodeType::Boolean
             }
         }
     }
 
-    fn power(&mut self, a: ExprId, x: &Term, b: ExprId, y: &Term) -> Kind {
+    fn power(&mut self, a: ExprId, x: &Term, b: ExprId, y: &Term) -> NodeType {
         let none = Term::known(Dimension::NONE);
         if !self.unify(y, &none) {
             let error = Diagnostic::error("E0104", format!("an exponent is a pure number, not {}", self.described(y)))
                 .label(self.system.span(b), self.shown(y))
                 .help(format!("divide it by a quantity of its kind: `({} / 1 {})`", self.text(b), self.shown(y)));
             self.diagnostics.push(error);
-            return Kind::Unknown;
+            return NodeType::Unknown;
         }
         if self.resolved(x) == none {
-            return Kind::Real(none);
+            return NodeType::Real(none);
         }
         match self.constant(b).and_then(Ratio::approximate) {
-            Some(exponent) => Kind::Real(none.times(x, exponent)),
+            Some(exponent) => NodeType::Real(none.times(x, exponent)),
             None => {
                 let resolved = self.resolved(x);
                 if !resolved.unknowns.is_empty() {
                     self.unify(x, &none);
-                    return Kind::Real(none);
+                    return NodeType::Real(none);
                 }
                 let error =
                     Diagnostic::error("E0105", format!("the exponent of {} must be a number", self.described(x)))
@@ -618,7 +618,7 @@ impl Checker<'_> {
                         .label(self.system.span(a), self.shown(x))
                         .help(format!("make the base a pure number: `({} / 1 {}) ^ …`", self.text(a), self.shown(x)));
                 self.diagnostics.push(error);
-                Kind::Unknown
+                NodeType::Unknown
             }
         }
     }
@@ -629,12 +629,12 @@ impl Checker<'_> {
     }
 
     /// Checks the arguments of a call against the units in the function's signature.
-    fn call(&mut self, builtin: Builtin, args: &[ExprId]) -> Kind {
+    fn call(&mut self, builtin: Builtin, args: &[ExprId]) -> NodeType {
         let terms: Option<Vec<Term>> = {
             let all: Vec<Option<Term>> = args.iter().map(|arg| self.real(*arg)).collect();
             all.into_iter().collect()
         };
-        let Some(terms) = terms else { return Kind::Unknown };
+        let Some(terms) = terms else { return NodeType::Unknown };
         let signature = builtin.signature();
         let of =
             |units: Units| signature.arguments.iter().zip(args).zip(&terms).filter(move |((a, _), _)| a.1 == units);
@@ -647,7 +647,7 @@ impl Checker<'_> {
                     let message =
                         format!("`{}` compares {} with {}", builtin.name(), self.described(x), self.described(y));
                     self.differ("E0101", message, first, x, other, y);
-                    return Kind::Unknown;
+                    return NodeType::Unknown;
                 }
             }
         }
@@ -662,7 +662,7 @@ impl Checker<'_> {
                         self.not_a_number(builtin, *arg, term);
                         // Rounding a quantity requires a unit to round to; the SI unit would be a guess.
                         if builtin == Builtin::Floor {
-                            return Kind::Unknown;
+                            return NodeType::Unknown;
                         }
                     }
                     continue;
@@ -675,7 +675,7 @@ impl Checker<'_> {
                 self.mismatch(*arg, term, &wanted);
             }
         }
-        Kind::Real(match signature.result {
+        NodeType::Real(match signature.result {
             Units::Number | Units::Any => none,
             Units::Same => same.clone(),
             Units::RootOfSame => none.times(same, Ratio::new(1, 2)),
@@ -699,9 +699,9 @@ impl Checker<'_> {
         self.diagnostics.push(Diagnostic::error("E0104", message).label(self.system.span(arg), label).help(help));
     }
 
-    fn fits(&mut self, value: ExprId, dimension: Dimension, role: &Role) -> Kind {
+    fn fits(&mut self, value: ExprId, dimension: Dimension, role: &Role) -> NodeType {
         let wanted = Term::known(dimension);
-        let Some(term) = self.real(value) else { return Kind::Real(wanted) };
+        let Some(term) = self.real(value) else { return NodeType::Real(wanted) };
         if !self.unify(&term, &wanted) {
             let (found, needed) = (self.described(&term), dimension.describe());
             match role {
@@ -727,7 +727,7 @@ impl Checker<'_> {
                 }
             }
         }
-        Kind::Real(wanted)
+        NodeType::Real(wanted)
     }
 
     // ---- lint `angle`
@@ -792,7 +792,7 @@ impl Checker<'_> {
                 }
             }
             for bound in [var.range.low, var.range.high].into_iter().flatten().map(|(bound, _)| bound) {
-                if let (Kind::Real(wanted), Kind::Real(found)) = (&kind, self.kind(bound).clone())
+                if let (NodeType::Real(wanted), NodeType::Real(found)) = (&kind, self.kind(bound).clone())
                     && !self.unify(&found, wanted)
                 {
                     self.mismatch(bound, &found, &wanted.clone());
@@ -801,16 +801,16 @@ impl Checker<'_> {
         }
     }
 
-    fn defines(&mut self, id: VarId, kind: &Kind, value: ExprId, origin: Origin) {
+    fn defines(&mut self, id: VarId, kind: &NodeType, value: ExprId, origin: Origin) {
         let var = self.system.var(id);
         let (wanted, found) = match (kind, self.kind(value).clone()) {
-            (Kind::Real(wanted), Kind::Real(found)) => (wanted.clone(), found),
-            (Kind::Boolean, Kind::Boolean) | (Kind::Unknown, _) | (_, Kind::Unknown) => return,
-            (Kind::Real(_), Kind::Boolean) => {
+            (NodeType::Real(wanted), NodeType::Real(found)) => (wanted.clone(), found),
+            (NodeType::Boolean, NodeType::Boolean) | (NodeType::Unknown, _) | (_, NodeType::Unknown) => return,
+            (NodeType::Real(_), NodeType::Boolean) => {
                 self.real(value);
                 return;
             }
-            (Kind::Boolean, Kind::Real(_)) => {
+            (NodeType::Boolean, NodeType::Real(_)) => {
                 self.condition(value, &format!("`{}`", var.name));
                 return;
             }
@@ -916,10 +916,10 @@ impl Checker<'_> {
         }
     }
 
-    fn state(&mut self, id: VarId, kind: &Kind, initial: ExprId, rate: Option<ExprId>) {
+    fn state(&mut self, id: VarId, kind: &NodeType, initial: ExprId, rate: Option<ExprId>) {
         self.defines(id, kind, initial, self.system.start_origin(id));
         let Some(rate) = rate else { return };
-        let (Kind::Real(state), Some(found)) = (kind, self.real(rate)) else { return };
+        let (NodeType::Real(state), Some(found)) = (kind, self.real(rate)) else { return };
         let wanted = state.times(&Term::known(RATE), Ratio::ONE);
         if self.unify(&found, &wanted) {
             return;
@@ -928,7 +928,7 @@ impl Checker<'_> {
         let Definition::Continuous { path, span, .. } = &var.definition else { return };
         let (value, wanted, found) = match path {
             Some((value, along)) => match (self.kind(*value).clone(), &self.vars[along.0 as usize]) {
-                (Kind::Real(found), Kind::Real(s)) => (*value, state.times(s, Ratio::whole(-1)), found),
+                (NodeType::Real(found), NodeType::Real(s)) => (*value, state.times(s, Ratio::whole(-1)), found),
                 _ => return,
             },
             None => (rate, wanted, found),
@@ -990,12 +990,12 @@ impl Checker<'_> {
     }
 
     fn finish(self) -> Types {
-        let base = |checker: &Self, kind: &Kind| match kind {
-            Kind::Real(term) => {
+        let base = |checker: &Self, kind: &NodeType| match kind {
+            NodeType::Real(term) => {
                 let term = checker.resolved(term);
                 Some((term.base, term.unknowns.is_empty()))
             }
-            Kind::Boolean | Kind::Unknown => None,
+            NodeType::Boolean | NodeType::Unknown => None,
         };
         let mut units = Vec::with_capacity(self.vars.len());
         let mut lost: Vec<VarId> = Vec::new();
@@ -1007,10 +1007,10 @@ impl Checker<'_> {
                     let defined = match &var.definition {
                         Definition::Missing | Definition::Free => false,
                         Definition::Value(value, _) | Definition::Held { value, .. } => {
-                            *self.kind(*value) != Kind::Unknown
+                            *self.kind(*value) != NodeType::Unknown
                         }
-                        Definition::Continuous { rate, .. } => *self.kind(*rate) != Kind::Unknown,
-                        Definition::Sampled { next, .. } => *self.kind(*next) != Kind::Unknown,
+                        Definition::Continuous { rate, .. } => *self.kind(*rate) != NodeType::Unknown,
+                        Definition::Sampled { next, .. } => *self.kind(*next) != NodeType::Unknown,
                     };
                     if !known && defined && matches!(var.kind, VarKind::Output | VarKind::Let | VarKind::State) {
                         lost.push(VarId(k as u32));
@@ -1037,8 +1037,8 @@ impl Checker<'_> {
             .collect();
         let nodes: Vec<Option<Dimension>> =
             self.types.iter().map(|kind| base(&self, kind).map(|(dimension, _)| dimension)).collect();
-        let boolean = self.types.iter().map(|kind| *kind == Kind::Boolean).collect();
-        let boolean_vars = self.vars.iter().map(|kind| *kind == Kind::Boolean).collect();
+        let boolean = self.types.iter().map(|kind| *kind == NodeType::Boolean).collect();
+        let boolean_vars = self.vars.iter().map(|kind| *kind == NodeType::Boolean).collect();
         let quiet = !self.diagnostics.iter().any(Diagnostic::is_error);
         for (span, dimension) in holes {
             let fitting: Vec<String> = self

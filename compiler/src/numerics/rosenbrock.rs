@@ -44,7 +44,7 @@ pub fn rosenbrock(program: &Program) -> Option<Func> {
     }
     let trial = Trial::of(&program.description.layout)?;
     let build = Shared::new(Build::new("rosenbrock").with_pool(program.description.pool.clone()));
-    let (singular, look) = Step { program, build: &build, trial }.build();
+    let (singular, look) = RosenbrockStep { program, build: &build, trial }.build();
     let mut build = build.into_inner();
     let (pivot, looked_at, zero) = (build.int(PIVOT as i64), build.int(LOOK as i64), build.int(0));
     let why = build.select(singular, pivot, looked_at);
@@ -130,13 +130,13 @@ struct Found<'f, 'a> {
     scales: &'f [Real<'a>],
 }
 
-struct Step<'a> {
+struct RosenbrockStep<'a> {
     program: &'a Program,
     build: &'a Shared,
     trial: Trial,
 }
 
-impl<'a> Step<'a> {
+impl<'a> RosenbrockStep<'a> {
     /// Appends and stores everything. Returns whether a pivot is too small, and whether the caller must look at the
     /// trial.
     fn build(self) -> (Value, Value) {

@@ -79,7 +79,7 @@ fn unproven(rig: &Rig, places: &RigSpans, found: &mut Vec<Diagnostic>) {
 }
 
 /// Response of a command to a signal near rest: stiffness K in N·m/rad and damping B in N·m·s/rad, both resisting.
-struct Contact {
+struct ContactResponse {
     stiffness: f64,
     damping: f64,
 }
@@ -183,7 +183,14 @@ fn emulation(rig: &Rig, control: &Program, plant: &Program, places: &RigSpans, f
 }
 
 /// The response of one command to speed and position at rest, as resistance of the shaft.
-fn contact(rig: &Rig, control: &Program, plant: &Program, command: Signal, slot: Slot, tau: f64) -> Option<Contact> {
+fn contact(
+    rig: &Rig,
+    control: &Program,
+    plant: &Program,
+    command: Signal,
+    slot: Slot,
+    tau: f64,
+) -> Option<ContactResponse> {
     // A contact responds to the speed; its integral acts as a spring. A response to the position is a controller.
     let speeds: Vec<Slot> =
         rig.inputs.iter().filter(|input| input.signal.what == SignalKind::Speed).map(|input| input.slot).collect();
@@ -202,7 +209,7 @@ fn contact(rig: &Rig, control: &Program, plant: &Program, command: Signal, slot:
     let (p, states) = linear(plant, &[*torque], &[*speed])?;
     let gain: f64 = (0..states).map(|i| p.c[i] * p.b[i]).sum();
     let sign = if gain < 0.0 { -1.0 } else { 1.0 };
-    Some(Contact { stiffness: sign * stiffness, damping: sign * damping })
+    Some(ContactResponse { stiffness: sign * stiffness, damping: sign * damping })
 }
 
 fn resolution(rig: &Rig, control: &Program, places: &RigSpans, found: &mut Vec<Diagnostic>) {

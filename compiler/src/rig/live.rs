@@ -40,7 +40,7 @@ struct LiveParam {
 }
 
 /// A command that is sent in a field of a frame.
-pub struct Command {
+pub struct FieldCommand {
     /// The command as written: `panel.lamp`.
     pub path: String,
     /// Its unit.
@@ -62,7 +62,7 @@ pub struct Fixed<'a> {
     /// Periods of sampled blocks, each with the step in s that must divide it.
     pub periods: &'a [(ExprId, f64)],
     /// Commands that are sent in fields of frames.
-    pub commands: &'a [Command],
+    pub commands: &'a [FieldCommand],
 }
 
 /// Analyses a system whose values have been checked.
@@ -168,7 +168,7 @@ fn conditions(system: &System, types: &Types, files: &Files, fixed: &Fixed, want
         let message = format!("{unmet}: {} requires {condition}{place}", owner.model);
         Check::Require { message, value: wanted.slot(require.condition) }
     }));
-    checks.extend(fixed.commands.iter().map(|Command { path, unit, value, range }| Check::Carried {
+    checks.extend(fixed.commands.iter().map(|FieldCommand { path, unit, value, range }| Check::Carried {
         path: path.clone(),
         unit: unit.clone(),
         value: wanted.slot(*value),

@@ -198,7 +198,7 @@ pub fn read<'a>(
     let rig = prepared.rig();
     let misread = loaded.diagnostics.iter().any(|d| d.is_error() && within(rig.span, d.span()));
     let statements = Statements::of(rig, misread, diagnostics)?;
-    let mut reader = Reader {
+    let mut reader = RigReader {
         loaded,
         files: &loaded.files,
         rig,
@@ -265,7 +265,7 @@ struct ExprIndices {
     /// For each bus its bit rate.
     bit_rates: Vec<Option<usize>>,
     /// Commands.
-    sends: Vec<Command>,
+    sends: Vec<OutputCommand>,
     /// Outputs of the part: the wire in `hardware`, and its value.
     gives: Vec<(usize, usize)>,
     stops: Vec<usize>,
@@ -273,7 +273,7 @@ struct ExprIndices {
 }
 
 /// `drive.signal = expr limit a .. b slew r`
-struct Command {
+struct OutputCommand {
     node: usize,
     read: SignalRef,
     unit: Unit,
@@ -287,7 +287,7 @@ struct Command {
     span: Span,
 }
 
-struct Reader<'a, 'd> {
+struct RigReader<'a, 'd> {
     loaded: &'a Loaded,
     files: &'a Files,
     rig: &'a ast::Rig,
@@ -301,7 +301,7 @@ fn unit(text: &str) -> Unit {
     Unit::parse(text).expect("a unit that is known")
 }
 
-impl<'a> Reader<'a, '_> {
+impl<'a> RigReader<'a, '_> {
     fn report(&mut self, diagnostic: Diagnostic) {
         self.diagnostics.push(diagnostic);
     }
@@ -461,7 +461,7 @@ impl<'a> Reader<'a, '_> {
         let slew = wire.slew.as_ref();
         let slew = slew.map(|slew| self.expressions.constant(scope, slew, "slew", per_second, declared));
         let (path, span) = (wire.path.span, wire.span);
-        lists.sends.push(Command { node: at, read, unit, inside, value, limit, slew, safe: None, path, span });
+        lists.sends.push(OutputCommand { node: at, read, unit, inside, value, limit, slew, safe: None, path, span });
     }
 
     fn safe(&mut self, lists: &mut ExprIndices) {
@@ -660,9 +660,9 @@ impl<'a> Reader<'a, '_> {
                 continue;
             };
             let (range, path) = (frames::carries(&messages[m].fields[f]), self.files.slice(send.path).to_string());
-            fielded.push(live::Command { path, unit: send.unit.clone(), value: at(send.value), range });
+            fielded.push(live::FieldCommand { path, unit: send.unit.clone(), value: at(send.value), range });
         }
-        for live::Command { path, unit, value: expr, range } in &fielded {
+        for live::FieldCommand { path, unit, value: expr, range } in &fielded {
             // NaN for values that are not known before the run.
             let value = evaluate(&system, &types, &[*expr])[0];
             if value < range.0 || value > range.1 {

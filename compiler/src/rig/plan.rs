@@ -10,7 +10,7 @@ use crate::ir::program::Program;
 use crate::lower::{self, lower};
 use frames::{MessageLayout, OnBus};
 
-impl Reader<'_, '_> {
+impl RigReader<'_, '_> {
     /// Everything of the plan except signals and slots.
     pub(super) fn plan(
         &mut self,
@@ -58,7 +58,8 @@ impl Reader<'_, '_> {
             nodes.push(node);
             laid_out.push(laid);
         }
-        let signal = |send: &Command| Signal { node: send.node, what: frames::what(send.read, &laid_out[send.node]) };
+        let signal =
+            |send: &OutputCommand| Signal { node: send.node, what: frames::what(send.read, &laid_out[send.node]) };
         for send in &lists.sends {
             if let SignalKind::Field(m, f) = signal(send).what
                 && let rig::Kind::Frames(messages) = &nodes[send.node].kind
@@ -312,7 +313,7 @@ impl Reader<'_, '_> {
 
     fn output(
         &mut self,
-        send: &Command,
+        send: &OutputCommand,
         signal: Signal,
         nodes: &[rig::Node],
         number: &dyn Fn(usize) -> f64,

@@ -7,7 +7,7 @@
 
 use super::*;
 
-impl Reader<'_, '_> {
+impl RigReader<'_, '_> {
     /// The quantities of the part that wires define.
     pub(super) fn gives(
         &mut self,
@@ -268,7 +268,7 @@ impl Reader<'_, '_> {
     }
 
     /// The quantity that a drive applies: its own measurement of the command, or for a device a quantity of its own.
-    fn applied_signal(&mut self, plant: &mut System, framed: &RigFrame, send: &Command, command: VarId) -> VarId {
+    fn applied_signal(&mut self, plant: &mut System, framed: &RigFrame, send: &OutputCommand, command: VarId) -> VarId {
         let node = framed.nodes[send.node];
         let name = self.files.slice(send.path).rsplit('.').next().unwrap_or_default().trim().to_string();
         let own = plant.var_ids().find(|id| {

@@ -7,7 +7,7 @@ use std::fmt;
 
 /// A frame of a log.
 #[derive(Clone, PartialEq, Eq, Debug)]
-pub struct Entry {
+pub struct LoggedFrame {
     /// Time in ns since 1970, or since the origin of the log.
     pub time_ns: u64,
     /// The interface that received it.
@@ -16,7 +16,7 @@ pub struct Entry {
     pub frame: Frame,
 }
 
-impl fmt::Display for Entry {
+impl fmt::Display for LoggedFrame {
     fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
         let (seconds, micros) = (self.time_ns / 1_000_000_000, self.time_ns / 1000 % 1_000_000);
         write!(f, "({seconds:010}.{micros:06}) {} {}", self.interface, self.frame)
@@ -24,7 +24,7 @@ impl fmt::Display for Entry {
 }
 
 /// Parses a line. None: an empty line, a comment, or an error frame, which is no traffic. Error: the message.
-pub fn entry(line: &str) -> Result<Option<Entry>, String> {
+pub fn entry(line: &str) -> Result<Option<LoggedFrame>, String> {
     let line = line.trim();
     if line.is_empty() || line.starts_with('#') {
         return Ok(None);
@@ -41,7 +41,7 @@ pub fn entry(line: &str) -> Result<Option<Entry>, String> {
         .and_then(|time| time.strip_suffix(')'))
         .and_then(nanoseconds)
         .ok_or_else(|| format!("`{time}` is no time: (1436509052.249713)"))?;
-    Ok(parse_frame(frame)?.map(|frame| Entry { time_ns, interface: interface.into(), frame }))
+    Ok(parse_frame(frame)?.map(|frame| LoggedFrame { time_ns, interface: interface.into(), frame }))
 }
 
 /// Parses decimal seconds without floating point, which has no resolution of nanoseconds for times since 1970.

@@ -4,7 +4,7 @@
 //! recorded frames with its identifier: these are no longer received, and each sent frame is compared with the next
 //! recorded one.
 
-use super::log::{self, Entry};
+use super::log::{self, LoggedFrame};
 use super::sim::Simulation;
 use super::{Bus, CannotOpen, Event, Filter, Frame, Health, Options, Received, Refused};
 use crate::realtime::clock::Clock;
@@ -42,7 +42,7 @@ impl Replay {
             remedy: Some("a log as `candump -L` writes it: (1436509052.249713) can0 181#AABB".into()),
         };
         let text = std::fs::read_to_string(path).map_err(|error| cannot(error.to_string()))?;
-        let mut entries: Vec<Entry> = Vec::new();
+        let mut entries: Vec<LoggedFrame> = Vec::new();
         for (number, line) in (1..).zip(text.lines()) {
             let entry = log::entry(line).map_err(|error| cannot(format!("line {number}: {error}")))?;
             let Some(entry) = entry else { continue };
@@ -52,7 +52,7 @@ impl Replay {
             entries.push(entry);
         }
         let first_ns = entries.first().map(|entry| entry.time_ns).ok_or_else(|| cannot("it has no frame".into()))?;
-        let recorded = |entry: Entry| Recorded {
+        let recorded = |entry: LoggedFrame| Recorded {
             after_ns: entry.time_ns - first_ns,
             frame: entry.frame,
             ours: false,

@@ -11,7 +11,7 @@
 
 use super::address::SLCAN_BIT_RATES;
 use super::descriptor;
-use super::text_stream::{Shape, TextStream};
+use super::text_stream::{MessageShape, TextStream};
 use super::{Bus, CannotOpen, Filter, Frame, Health, Options, Prepared, Received, Refused, State};
 use crate::realtime::clock::{Clock, Monotonic};
 use std::fs::{File, OpenOptions};
@@ -130,7 +130,7 @@ impl Slcan {
     }
 
     fn new(fd: OwnedFd, clock: Monotonic, side: Side, filter: Filter) -> Slcan {
-        let shape = Shape { is_end, unfinished: 4 * LINE, incoming: INCOMING, outgoing: OUTGOING };
+        let shape = MessageShape { is_end, unfinished: 4 * LINE, incoming: INCOMING, outgoing: OUTGOING };
         Slcan { stream: TextStream::new(fd, clock, shape), side, filter }
     }
 

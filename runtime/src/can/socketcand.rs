@@ -6,7 +6,7 @@
 //! The server sends `< hi >`; the client sends `< open can0 >` and `< rawmode >`, each answered by `< ok >`. Then the
 //! client sends frames as `< send 123 2 aa b >` and receives them as `< frame 123 1700000000.123456 AABB >`.
 
-use super::text_stream::{Shape, TextStream};
+use super::text_stream::{MessageShape, TextStream};
 use super::{Bus, CannotOpen, Filter, Frame, Health, Options, Prepared, Received, Refused};
 use crate::realtime::clock::{Clock, Monotonic};
 use std::io::{self, Cursor, Read, Write};
@@ -44,7 +44,11 @@ fn stream_of(tcp: TcpStream, clock: Monotonic) -> io::Result<Stream> {
     tcp.set_nonblocking(true)?;
     tcp.set_nodelay(true)?;
     acknowledge_at_once(&tcp);
-    Ok(TextStream::new(tcp, clock, Shape { is_end, unfinished: UNFINISHED, incoming: INCOMING, outgoing: OUTGOING }))
+    Ok(TextStream::new(
+        tcp,
+        clock,
+        MessageShape { is_end, unfinished: UNFINISHED, incoming: INCOMING, outgoing: OUTGOING },
+    ))
 }
 
 /// Requests an immediate TCP acknowledgement, because the other end may hold back its next message until then. The
@@ -228,19 +232,19 @@ impl Server {
         let (tcp, _) = self.listener.accept().ok()?;
         let mut stream = stream_of(tcp, self.clock).ok()?;
         stream.send(b"< hi >").ok()?;
-        Some(Connection { stream, phase: Phase::Greeted })
+        Some(Connection { stream, phase: Handshake::Greeted })
     }
 }
 
 /// A connected client.
 pub struct Connection {
     stream: Stream,
-    phase: Phase,
+    phase: Handshake,
 }
 
 /// Progress of the handshake.
 #[derive(Clone, Copy, PartialEq)]
-enum Phase {
+enum Handshake {
     Greeted,
     /// The client may send, and receives nothing.
     Opened,
@@ -256,19 +260,19 @@ impl Connection {
         let text = std::str::from_utf8(message).unwrap_or_default().trim_start_matches(['<', ' ', '\n', '\r']);
         let mut words = text.split_ascii_whitespace();
         let answer: &[u8] = match (words.next(), self.phase) {
-            (Some("open"), Phase::Greeted) if words.next().is_some() => {
-                self.phase = Phase::Opened;
+            (Some("open"), Handshake::Greeted) if words.next().is_some() => {
+                self.phase = Handshake::Opened;
                 b"< ok >"
             }
-            (Some("rawmode"), Phase::Opened) => {
-                self.phase = Phase::Raw(now_ns + PAUSE_NS);
+            (Some("rawmode"), Handshake::Opened) => {
+                self.phase = Handshake::Raw(now_ns + PAUSE_NS);
                 b"< ok >"
             }
             (Some("echo"), _) => b"< echo >",
-            (Some("send"), Phase::Opened | Phase::Raw(_)) => match decode_send(words) {
+            (Some("send"), Handshake::Opened | Handshake::Raw(_)) => match decode_send(words) {
                 Some(frame) => {
                     // A client that sends has read the answers: frames may follow immediately.
-                    if let Phase::Raw(from_ns) = &mut self.phase {
+                    if let Handshake::Raw(from_ns) = &mut self.phase {
                         *from_ns = 0;
                     }
                     return Some(Some(frame));
@@ -286,9 +290,9 @@ impl Connection {
 impl Bus for Connection {
     fn send(&mut self, frame: Frame) -> Result<(), Refused> {
         match self.phase {
-            Phase::Raw(from_ns) if self.stream.clock.now_ns() >= from_ns => {}
+            Handshake::Raw(from_ns) if self.stream.clock.now_ns() >= from_ns => {}
             // The client does not receive yet.
-            Phase::Greeted | Phase::Opened | Phase::Raw(_) => return Ok(()),
+            Handshake::Greeted | Handshake::Opened | Handshake::Raw(_) => return Ok(()),
         }
         if frame.is_remote() {
             return Err(Refused::Unable);

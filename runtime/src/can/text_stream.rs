@@ -9,7 +9,7 @@ use crate::realtime::clock::{Clock, Monotonic};
 use std::os::fd::{AsRawFd, RawFd};
 
 /// What a protocol knows of its messages.
-pub(super) struct Shape {
+pub(super) struct MessageShape {
     /// Whether a byte ends a message.
     pub is_end: fn(u8) -> bool,
     /// A message of more bytes without its end is discarded.
@@ -32,8 +32,8 @@ pub(super) struct TextStream<D> {
 }
 
 impl<D: AsRawFd> TextStream<D> {
-    pub fn new(descriptor: D, clock: Monotonic, shape: Shape) -> TextStream<D> {
-        let Shape { is_end, unfinished, incoming, outgoing } = shape;
+    pub fn new(descriptor: D, clock: Monotonic, shape: MessageShape) -> TextStream<D> {
+        let MessageShape { is_end, unfinished, incoming, outgoing } = shape;
         let (incoming, outgoing) = (Incoming::new(incoming), Outgoing::new(outgoing));
         let (health, down_told) = (Health::default(), false);
         TextStream { descriptor, clock, incoming, outgoing, health, is_end, unfinished, down_told }

@@ -61,7 +61,7 @@ pub enum Outcome {
 }
 
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
-enum Stage {
+enum TransferStage {
     Rest,
     /// Waits for the answer to a read request.
     Read,
@@ -99,7 +99,7 @@ fn segment(id: u32, toggle: bool, bytes: &[u8], last: bool) -> Frame {
 pub struct Client {
     node: u8,
     timeout_ns: u64,
-    stage: Stage,
+    stage: TransferStage,
     outcome: Outcome,
     object: Object,
     buffer: [u8; LONGEST],
@@ -115,7 +115,7 @@ impl Client {
         Client {
             node,
             timeout_ns,
-            stage: Stage::Rest,
+            stage: TransferStage::Rest,
             outcome: Outcome::Idle,
             object: Object(0, 0),
             buffer: [0; LONGEST],
@@ -131,7 +131,7 @@ impl Client {
 
     /// Requests the bytes of an object. An unfinished request is discarded.
     pub fn read(&mut self, object: Object, now_ns: u64, send: Send) {
-        self.begin(Stage::Read, object, now_ns);
+        self.begin(TransferStage::Read, object, now_ns);
         send(frame(self.request(), 0x40, object, 0));
     }
 
@@ -141,7 +141,7 @@ impl Client {
     /// If there are none or more than [`LONGEST`]: an error of the caller.
     pub fn write(&mut self, object: Object, bytes: &[u8], now_ns: u64, send: Send) {
         assert!((1..=LONGEST).contains(&bytes.len()), "{} bytes to {object}", bytes.len());
-        self.begin(Stage::Write, object, now_ns);
+        self.begin(TransferStage::Write, object, now_ns);
         self.buffer[..bytes.len()].copy_from_slice(bytes);
         self.length = bytes.len();
         if bytes.len() <= 4 {
@@ -154,7 +154,7 @@ impl Client {
         }
     }
 
-    fn begin(&mut self, stage: Stage, object: Object, now_ns: u64) {
+    fn begin(&mut self, stage: TransferStage, object: Object, now_ns: u64) {
         (self.stage, self.outcome, self.object) = (stage, Outcome::Busy, object);
         (self.length, self.moved, self.deadline_ns) = (0, 0, now_ns + self.timeout_ns);
     }
@@ -175,7 +175,7 @@ impl Client {
     }
 
     fn end(&mut self, outcome: Outcome) {
-        (self.stage, self.outcome) = (Stage::Rest, outcome);
+        (self.stage, self.outcome) = (TransferStage::Rest, outcome);
     }
 
     fn abort(&mut self, abort: Abort, send: Send) {
@@ -185,7 +185,7 @@ impl Client {
 
     /// Checks the time-out: an overdue answer fails the request.
     pub fn poll(&mut self, now_ns: u64, send: Send) {
-        if self.stage != Stage::Rest && now_ns >= self.deadline_ns {
+        if self.stage != TransferStage::Rest && now_ns >= self.deadline_ns {
             self.abort(Abort::TIMED_OUT, send);
             self.outcome = Outcome::Failed(Failure::Silence);
         }
@@ -194,7 +194,7 @@ impl Client {
     /// Receives an answer of the server. Unexpected answers are ignored.
     pub fn receive(&mut self, answer: &Frame, now_ns: u64, send: Send) {
         let Ok(data) = <&[u8; 8]>::try_from(answer.data()) else { return };
-        if answer.id() != 0x580 + u32::from(self.node) || self.stage == Stage::Rest {
+        if answer.id() != 0x580 + u32::from(self.node) || self.stage == TransferStage::Rest {
             return;
         }
         if data[0] == 0x80 {
@@ -205,9 +205,9 @@ impl Client {
         }
         self.deadline_ns = now_ns + self.timeout_ns;
         match self.stage {
-            Stage::Rest => {}
-            Stage::Read | Stage::Write if object(data) != self.object => {}
-            Stage::Read => match data[0] {
+            TransferStage::Rest => {}
+            TransferStage::Read | TransferStage::Write if object(data) != self.object => {}
+            TransferStage::Read => match data[0] {
                 command if command & 0xE2 == 0x42 => {
                     self.length = if command & 1 == 1 { 4 - usize::from(command >> 2 & 3) } else { 4 };
                     self.buffer[..self.length].copy_from_slice(&data[4..4 + self.length]);
@@ -217,12 +217,12 @@ impl Client {
                     if command & 1 == 1 && word(data) as usize > LONGEST {
                         return self.abort(Abort::MEMORY, send);
                     }
-                    self.stage = Stage::ReadSegment(false);
+                    self.stage = TransferStage::ReadSegment(false);
                     send(Frame::new(self.request(), &[0x60, 0, 0, 0, 0, 0, 0, 0]));
                 }
                 _ => self.abort(Abort::COMMAND, send),
             },
-            Stage::ReadSegment(toggle) => {
+            TransferStage::ReadSegment(toggle) => {
                 if data[0] & 0xE0 != 0 {
                     return self.abort(Abort::COMMAND, send);
                 }
@@ -239,15 +239,15 @@ impl Client {
                     self.length = self.moved;
                     return self.end(Outcome::Done);
                 }
-                self.stage = Stage::ReadSegment(!toggle);
+                self.stage = TransferStage::ReadSegment(!toggle);
                 send(Frame::new(self.request(), &[0x60 | u8::from(!toggle) << 4, 0, 0, 0, 0, 0, 0, 0]));
             }
-            Stage::Write => match data[0] {
+            TransferStage::Write => match data[0] {
                 0x60 if self.length <= 4 => self.end(Outcome::Done),
                 0x60 => self.send_segment(false, send),
                 _ => self.abort(Abort::COMMAND, send),
             },
-            Stage::WriteSegment(toggle) => match data[0] {
+            TransferStage::WriteSegment(toggle) => match data[0] {
                 command if command & 0xEF != 0x20 => self.abort(Abort::COMMAND, send),
                 command if (command & 0x10 != 0) != toggle => self.abort(Abort::TOGGLE, send),
                 _ if self.moved == self.length => self.end(Outcome::Done),
@@ -260,7 +260,7 @@ impl Client {
         let end = self.length.min(self.moved + 7);
         send(segment(self.request(), toggle, &self.buffer[self.moved..end], end == self.length));
         self.moved = end;
-        self.stage = Stage::WriteSegment(toggle);
+        self.stage = TransferStage::WriteSegment(toggle);
     }
 }
 
@@ -268,7 +268,7 @@ impl Client {
 #[derive(Clone, Debug)]
 pub struct Server {
     node: u8,
-    stage: Stage,
+    stage: TransferStage,
     object: Object,
     buffer: [u8; LONGEST],
     length: usize,
@@ -278,7 +278,7 @@ pub struct Server {
 impl Server {
     /// A server of `node`.
     pub fn new(node: u8) -> Server {
-        Server { node, stage: Stage::Rest, object: Object(0, 0), buffer: [0; LONGEST], length: 0, moved: 0 }
+        Server { node, stage: TransferStage::Rest, object: Object(0, 0), buffer: [0; LONGEST], length: 0, moved: 0 }
     }
 
     fn answer(&self) -> u32 {
@@ -287,11 +287,11 @@ impl Server {
 
     /// Discards a transfer in progress, because the node was reset.
     pub fn reset(&mut self) {
-        self.stage = Stage::Rest;
+        self.stage = TransferStage::Rest;
     }
 
     fn abort(&mut self, object: Object, abort: Abort, send: Send) {
-        self.stage = Stage::Rest;
+        self.stage = TransferStage::Rest;
         send(frame(self.answer(), 0x80, object, abort.0));
     }
 
@@ -302,7 +302,7 @@ impl Server {
             return;
         }
         match data[0] >> 5 {
-            _ if data[0] == 0x80 => self.stage = Stage::Rest,
+            _ if data[0] == 0x80 => self.stage = TransferStage::Rest,
             0 => self.take_segment(data, objects, send),
             1 => self.begin_write(data, objects, send),
             2 => self.begin_read(object(data), objects, send),
@@ -312,7 +312,7 @@ impl Server {
     }
 
     fn begin_read(&mut self, object: Object, objects: &mut dyn Objects, send: Send) {
-        self.stage = Stage::Rest;
+        self.stage = TransferStage::Rest;
         let bytes = match objects.read(object) {
             Ok(bytes) if bytes.len() > LONGEST => return self.abort(object, Abort::MEMORY, send),
             Ok(bytes) => bytes,
@@ -326,7 +326,7 @@ impl Server {
         } else {
             self.buffer[..length].copy_from_slice(bytes);
             (self.object, self.length, self.moved) = (object, length, 0);
-            self.stage = Stage::ReadSegment(false);
+            self.stage = TransferStage::ReadSegment(false);
             send(frame(self.answer(), 0x41, object, length as u32));
         }
     }
@@ -334,20 +334,20 @@ impl Server {
     fn give_segment(&mut self, data: &[u8; 8], send: Send) {
         let asked = data[0] & 0x10 != 0;
         match self.stage {
-            Stage::ReadSegment(toggle) if toggle == asked => {
+            TransferStage::ReadSegment(toggle) if toggle == asked => {
                 let end = self.length.min(self.moved + 7);
                 let last = end == self.length;
                 send(segment(self.answer(), toggle, &self.buffer[self.moved..end], last));
                 self.moved = end;
-                self.stage = if last { Stage::Rest } else { Stage::ReadSegment(!toggle) };
+                self.stage = if last { TransferStage::Rest } else { TransferStage::ReadSegment(!toggle) };
             }
-            Stage::ReadSegment(_) => self.abort(self.object, Abort::TOGGLE, send),
+            TransferStage::ReadSegment(_) => self.abort(self.object, Abort::TOGGLE, send),
             _ => self.abort(Object(0, 0), Abort::COMMAND, send),
         }
     }
 
     fn begin_write(&mut self, data: &[u8; 8], objects: &mut dyn Objects, send: Send) {
-        self.stage = Stage::Rest;
+        self.stage = TransferStage::Rest;
         let object = object(data);
         let (expedited, sized) = (data[0] & 2 != 0, data[0] & 1 != 0);
         if expedited {
@@ -365,15 +365,15 @@ impl Server {
             return self.abort(object, Abort::MEMORY, send);
         }
         (self.object, self.length, self.moved) = (object, if sized { word(data) as usize } else { 0 }, 0);
-        self.stage = Stage::WriteSegment(false);
+        self.stage = TransferStage::WriteSegment(false);
         send(frame(self.answer(), 0x60, object, 0));
     }
 
     fn take_segment(&mut self, data: &[u8; 8], objects: &mut dyn Objects, send: Send) {
         let object = self.object;
         let toggle = match self.stage {
-            Stage::WriteSegment(toggle) if toggle == (data[0] & 0x10 != 0) => toggle,
-            Stage::WriteSegment(_) => return self.abort(object, Abort::TOGGLE, send),
+            TransferStage::WriteSegment(toggle) if toggle == (data[0] & 0x10 != 0) => toggle,
+            TransferStage::WriteSegment(_) => return self.abort(object, Abort::TOGGLE, send),
             _ => return self.abort(Object(0, 0), Abort::COMMAND, send),
         };
         let count = 7 - usize::from(data[0] >> 1 & 7);
@@ -389,9 +389,9 @@ impl Server {
             if let Err(abort) = objects.write(object, &self.buffer[..self.moved]) {
                 return self.abort(object, abort, send);
             }
-            self.stage = Stage::Rest;
+            self.stage = TransferStage::Rest;
         } else {
-            self.stage = Stage::WriteSegment(!toggle);
+            self.stage = TransferStage::WriteSegment(!toggle);
         }
         send(Frame::new(self.answer(), &[0x20 | u8::from(toggle) << 4, 0, 0, 0, 0, 0, 0, 0]));
     }

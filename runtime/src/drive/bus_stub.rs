@@ -3,14 +3,19 @@
 
 use crate::can::sim::{Actor, Port, SimBus, Simulation};
 use crate::can::{Bus, Received};
-use crate::drive::simulated_plant::Bench;
+use crate::drive::simulated_plant::SimulatedBench;
 use abi::rig::Rig;
 use std::cell::RefCell;
 use std::rc::Rc;
 
 /// Connects the nodes of a rig to its simulated buses, under their own names. `buses`: in the order of the rig. Between
 /// events the nodes remain accessible for inspection and fault injection.
-pub fn attend(simulation: &Simulation, buses: &[SimBus], rig: &Rig, bench: Bench) -> Rc<RefCell<Bench>> {
+pub fn attend(
+    simulation: &Simulation,
+    buses: &[SimBus],
+    rig: &Rig,
+    bench: SimulatedBench,
+) -> Rc<RefCell<SimulatedBench>> {
     let ports = rig.nodes.iter().map(|node| buses[node.bus].port(&node.name)).collect();
     let bench = Rc::new(RefCell::new(bench));
     simulation.attend(Box::new(Nodes { ports, bench: bench.clone() }));
@@ -19,7 +24,7 @@ pub fn attend(simulation: &Simulation, buses: &[SimBus], rig: &Rig, bench: Bench
 
 struct Nodes {
     ports: Vec<Port>,
-    bench: Rc<RefCell<Bench>>,
+    bench: Rc<RefCell<SimulatedBench>>,
 }
 
 impl Actor for Nodes {

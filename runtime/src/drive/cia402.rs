@@ -12,7 +12,7 @@ use crate::canopen::sdo::Client;
 use crate::canopen::service::{self, Service};
 use crate::canopen::{NmtState, Object, Send, Type};
 use crate::drive::faults::{Reading, RefusalReason, TroubleKind};
-use crate::drive::sdo_sequence::{Entry, Keep, Progress, Question, Script, Watching};
+use crate::drive::sdo_sequence::{Keep, Progress, Question, Script, SequenceEntry, Watching};
 use crate::safety::{Protection, is_present};
 use abi::rig::{Cia402, Mode, SignalKind};
 
@@ -101,13 +101,13 @@ struct Answer {
 
 /// Position of one signal in an answer.
 #[derive(Clone, Copy, Debug)]
-struct Place {
+struct SignalPosition {
     answer: usize,
     byte: usize,
     kind: Type,
 }
 
-impl Place {
+impl SignalPosition {
     fn number(&self, data: &[u8]) -> i64 {
         self.kind.number(&data[self.byte..self.byte + self.kind.size().unwrap_or(0)])
     }
@@ -131,10 +131,10 @@ pub struct Drive {
     booted: bool,
     command_pdo: Pdo,
     answers: Vec<Answer>,
-    status_at: Place,
-    torque_at: Option<Place>,
-    speed_at: Option<Place>,
-    position_at: Option<Place>,
+    status_at: SignalPosition,
+    torque_at: Option<SignalPosition>,
+    speed_at: Option<SignalPosition>,
+    position_at: Option<SignalPosition>,
     torque: Scale,
     speed: Scale,
     target: Scale,
@@ -209,7 +209,7 @@ impl Drive {
             answers
                 .iter()
                 .enumerate()
-                .find_map(|(answer, one)| one.pdo.place(object).map(|byte| Place { answer, byte, kind }))
+                .find_map(|(answer, one)| one.pdo.place(object).map(|byte| SignalPosition { answer, byte, kind }))
         };
         let of = |path: Option<Path>| path.and_then(|path| place(path.actual.0, signed(path.actual.1)));
         let mut drive = Drive {
@@ -267,47 +267,48 @@ impl Drive {
         self.setting.watchdog_ns.div_ceil(1_000_000).clamp(1, 65_535) as i64
     }
 
-    fn identity_list(&self) -> Vec<Entry> {
+    fn identity_list(&self) -> Vec<SequenceEntry> {
         let identity = |sub| Object(0x1018, sub);
         let mut list = vec![
-            Entry::Read(Object(0x1000, 0), Type::U32, Keep::DeviceType),
-            Entry::Read(identity(1), Type::U32, Keep::Vendor),
-            Entry::ReadIf(identity(2), Type::U32, Keep::Product),
-            Entry::ReadIf(identity(3), Type::U32, Keep::Revision),
-            Entry::ReadIf(identity(4), Type::U32, Keep::Serial),
-            Entry::TextIf(Object(0x1008, 0), profiles::SIMULATED.1, Keep::Name),
-            Entry::ReadIf(Object(0x6502, 0), Type::U32, Keep::Modes),
+            SequenceEntry::Read(Object(0x1000, 0), Type::U32, Keep::DeviceType),
+            SequenceEntry::Read(identity(1), Type::U32, Keep::Vendor),
+            SequenceEntry::ReadIf(identity(2), Type::U32, Keep::Product),
+            SequenceEntry::ReadIf(identity(3), Type::U32, Keep::Revision),
+            SequenceEntry::ReadIf(identity(4), Type::U32, Keep::Serial),
+            SequenceEntry::TextIf(Object(0x1008, 0), profiles::SIMULATED.1, Keep::Name),
+            SequenceEntry::ReadIf(Object(0x6502, 0), Type::U32, Keep::Modes),
         ];
         if self.profile.torque.is_some() {
-            list.push(Entry::Read(Object(0x6076, 0), Type::U32, Keep::RatedTorque));
+            list.push(SequenceEntry::Read(Object(0x6076, 0), Type::U32, Keep::RatedTorque));
         }
         list.extend([
-            Entry::ReadIf(Object(0x6072, 0), Type::U16, Keep::MaxTorque),
-            Entry::ReadIf(Object(0x6080, 0), Type::U32, Keep::MaxSpeed),
-            Entry::ReadIf(ERROR, Type::U16, Keep::Error),
-            Entry::Judge(Question::Identity),
+            SequenceEntry::ReadIf(Object(0x6072, 0), Type::U16, Keep::MaxTorque),
+            SequenceEntry::ReadIf(Object(0x6080, 0), Type::U32, Keep::MaxSpeed),
+            SequenceEntry::ReadIf(ERROR, Type::U16, Keep::Error),
+            SequenceEntry::Judge(Question::Identity),
         ]);
         list
     }
 
-    fn configuration_list(&self) -> Result<Vec<Entry>, String> {
+    fn configuration_list(&self) -> Result<Vec<SequenceEntry>, String> {
         let mut list = Vec::new();
-        let number = |object, value: u32, size| Entry::Write(object, value.into(), size);
+        let number = |object, value: u32, size| SequenceEntry::Write(object, value.into(), size);
         for pdo in self.answers.iter().map(|answer| &answer.pdo).chain([&self.command_pdo]) {
             if self.profile.fixed.is_some() {
                 list.push(number(Object(pdo.communication(), 2), pdo.kind.into(), 1));
             } else {
                 list.extend(pdo.configuration().into_iter().map(|(object, value, size)| number(object, value, size)));
             }
-            let compare = |(object, value, bits): (Object, u32, u32)| Entry::Compare(object, value.into(), bits.into());
+            let compare =
+                |(object, value, bits): (Object, u32, u32)| SequenceEntry::Compare(object, value.into(), bits.into());
             list.extend(pdo.read_back().into_iter().map(compare));
         }
         // The drive detects missing set-points even while our heartbeat arrives.
         let (deadline, ms) = (Object(self.command_pdo.communication(), 5), self.deadline_ms());
         if is_present(Protection::Deadline) {
-            list.push(Entry::WriteOr(deadline, ms, 2, 2));
-            list.push(Entry::Compare(deadline, ms, 0xFFFF));
-            list.push(Entry::Read(deadline, Type::U16, Keep::Deadline));
+            list.push(SequenceEntry::WriteOr(deadline, ms, 2, 2));
+            list.push(SequenceEntry::Compare(deadline, ms, 0xFFFF));
+            list.push(SequenceEntry::Read(deadline, Type::U16, Keep::Deadline));
         }
         if self.profile.fixed.is_none() {
             // Mode display and error code, sent on change, for drives with a third PDO.
@@ -315,69 +316,69 @@ impl Drive {
             let writes = Pdo::new(Direction::Transmit, 3, self.config.node, 255, &map).configuration();
             let count = writes.len();
             for (i, (object, value, size)) in writes.into_iter().enumerate() {
-                list.push(Entry::WriteOr(object, value.into(), size, count - 1 - i));
+                list.push(SequenceEntry::WriteOr(object, value.into(), size, count - 1 - i));
             }
         }
         // A drive that misses our heartbeat keeps its communication state, so that it can still be read. If the drive
         // offers no such choice, it falls back to pre-operational.
-        list.push(Entry::WriteOr(Object(0x1029, 1), 1, 1, 0));
+        list.push(SequenceEntry::WriteOr(Object(0x1029, 1), 1, 1, 0));
         if self.profile.life.contains(&Life::Heartbeat) {
             let consumer = Object(0x1016, 1);
             list.extend([
                 number(Object(0x1017, 0), HEARTBEAT_MS as u32, 2),
-                Entry::Compare(Object(0x1017, 0), HEARTBEAT_MS as i64, 0xFFFF),
-                Entry::Watch(consumer, self.setting.master, 3),
-                Entry::Watched(consumer, self.setting.master),
-                Entry::Judge(Question::Timeout(Watching::Heartbeat)),
-                Entry::Skip(7),
+                SequenceEntry::Compare(Object(0x1017, 0), HEARTBEAT_MS as i64, 0xFFFF),
+                SequenceEntry::Watch(consumer, self.setting.master, 3),
+                SequenceEntry::Watched(consumer, self.setting.master),
+                SequenceEntry::Judge(Question::Timeout(Watching::Heartbeat)),
+                SequenceEntry::Skip(7),
             ]);
         }
         let guard = i64::from(self.timeout_wanted_ms().div_ceil(3).max(1));
         list.extend([
-            Entry::WriteOr(Object(0x100C, 0), guard, 2, 5),
-            Entry::Write(Object(0x100D, 0), 3, 1),
-            Entry::Compare(Object(0x100C, 0), guard, 0xFFFF),
-            Entry::Compare(Object(0x100D, 0), 3, 0xFF),
-            Entry::Judge(Question::Timeout(Watching::Guarding)),
-            Entry::Skip(1),
-            Entry::Judge(Question::Timeout(Watching::Nothing)),
+            SequenceEntry::WriteOr(Object(0x100C, 0), guard, 2, 5),
+            SequenceEntry::Write(Object(0x100D, 0), 3, 1),
+            SequenceEntry::Compare(Object(0x100C, 0), guard, 0xFFFF),
+            SequenceEntry::Compare(Object(0x100D, 0), 3, 0xFF),
+            SequenceEntry::Judge(Question::Timeout(Watching::Guarding)),
+            SequenceEntry::Skip(1),
+            SequenceEntry::Judge(Question::Timeout(Watching::Nothing)),
             // Reaction to our loss: quick stop.
             number(Object(0x6007, 0), 3, 2),
-            Entry::Compare(Object(0x6007, 0), 3, 0xFFFF),
+            SequenceEntry::Compare(Object(0x6007, 0), 3, 0xFFFF),
             // After a quick stop the drive must be without torque: options 5 to 8 would permit a late command to enable
             // it again.
-            Entry::WriteOr(Object(0x605A, 0), 2, 2, 0),
-            Entry::Read(Object(0x605A, 0), Type::I16, Keep::QuickStop),
-            Entry::Judge(Question::QuickStop),
-            Entry::WriteOr(Object(0x1006, 0), (self.setting.period_ns / 1000) as i64, 4, 0),
+            SequenceEntry::WriteOr(Object(0x605A, 0), 2, 2, 0),
+            SequenceEntry::Read(Object(0x605A, 0), Type::I16, Keep::QuickStop),
+            SequenceEntry::Judge(Question::QuickStop),
+            SequenceEntry::WriteOr(Object(0x1006, 0), (self.setting.period_ns / 1000) as i64, 4, 0),
         ]);
         if let Some(most) = self.config.max_torque {
             let most = self.torque.command(most);
-            list.push(Entry::WriteOr(Object(0x6072, 0), most, 2, 1));
-            list.push(Entry::Compare(Object(0x6072, 0), most, 0xFFFF));
+            list.push(SequenceEntry::WriteOr(Object(0x6072, 0), most, 2, 1));
+            list.push(SequenceEntry::Compare(Object(0x6072, 0), most, 0xFFFF));
         }
         Ok(list)
     }
 
     /// Entries that depend on the mode of operation, once it has been chosen.
-    fn mode_list(&self) -> Result<Vec<Entry>, RefusalReason> {
+    fn mode_list(&self) -> Result<Vec<SequenceEntry>, RefusalReason> {
         let mut list = Vec::with_capacity(8);
         if self.mode == 4 {
             // The drive's own rate limiter: set to the slew limit of the rig, or disabled.
             let slope = (self.setting.slew / self.torque.step).min(f64::from(u32::MAX)) as i64;
-            list.push(Entry::Write(Object(0x6087, 0), slope, 4));
-            list.push(Entry::Compare(Object(0x6087, 0), slope, 0xFFFF_FFFF));
+            list.push(SequenceEntry::Write(Object(0x6087, 0), slope, 4));
+            list.push(SequenceEntry::Compare(Object(0x6087, 0), slope, 0xFFFF_FFFF));
         }
         if self.mode >= 8 {
             let (value, exponent) =
                 interpolation(self.setting.period_ns).ok_or(RefusalReason::Period(self.setting.period_ns))?;
-            list.push(Entry::WriteOr(Object(0x60C2, 1), value, 1, 3));
-            list.push(Entry::Write(Object(0x60C2, 2), exponent, 1));
-            list.push(Entry::Compare(Object(0x60C2, 1), value, 0xFF));
-            list.push(Entry::Compare(Object(0x60C2, 2), exponent, 0xFF));
+            list.push(SequenceEntry::WriteOr(Object(0x60C2, 1), value, 1, 3));
+            list.push(SequenceEntry::Write(Object(0x60C2, 2), exponent, 1));
+            list.push(SequenceEntry::Compare(Object(0x60C2, 1), value, 0xFF));
+            list.push(SequenceEntry::Compare(Object(0x60C2, 2), exponent, 0xFF));
         }
-        list.push(Entry::Write(MODE, self.mode.into(), 1));
-        list.push(Entry::Read(MODE_SHOWN, Type::I8, Keep::ModeShown));
+        list.push(SequenceEntry::Write(MODE, self.mode.into(), 1));
+        list.push(SequenceEntry::Read(MODE_SHOWN, Type::I8, Keep::ModeShown));
         Ok(list)
     }
 
@@ -464,7 +465,7 @@ impl Drive {
             self.surplus += 1;
         }
         (answer.age, answer.stamp_ns) = (0, stamp_ns);
-        let within = |place: Option<Place>| place.filter(|place| place.answer == at);
+        let within = |place: Option<SignalPosition>| place.filter(|place| place.answer == at);
         if let Some(place) = within(self.torque_at) {
             self.torque_now = place.number(data);
         }
@@ -535,7 +536,7 @@ impl Drive {
 
     /// A signal of the drive; none if it has no such signal.
     pub fn reading(&self, what: SignalKind) -> Option<Reading> {
-        let at = |place: Option<Place>, value: f64| {
+        let at = |place: Option<SignalPosition>, value: f64| {
             place.map(|place| {
                 let answer = &self.answers[place.answer];
                 Reading { value, stamp_ns: answer.stamp_ns, age: answer.age }

@@ -13,7 +13,7 @@ const PERIOD_NS: u64 = 100_000_000;
 
 /// One message with its values.
 #[derive(Clone, Debug)]
-struct Line {
+struct DeviceMessage {
     message: Message,
     values: Vec<Reading>,
     /// Safe values, SI.
@@ -27,7 +27,7 @@ struct Line {
 /// State of a device.
 #[derive(Clone, Debug)]
 pub struct Device {
-    lines: Vec<Line>,
+    lines: Vec<DeviceMessage>,
     moves: bool,
 }
 
@@ -63,7 +63,7 @@ impl Device {
             // We send to a drive in each tick, from the first one on: its safe values at first.
             let begins = if moves && message.send { safe_values.clone() } else { Vec::new() };
             let start = |(k, field): (usize, &abi::rig::Field)| begins.get(k).copied().unwrap_or(field.start);
-            Line {
+            DeviceMessage {
                 message: message.clone(),
                 values: message.fields.iter().enumerate().map(start).map(Reading::none).collect(),
                 safe: safe_values,

@@ -13,7 +13,7 @@ use crate::canopen::service::{self, Service};
 use crate::canopen::{Nmt, NmtState};
 use crate::drive::cia402::{Drive, Limits, Setting, Status};
 use crate::drive::faults::{Reading, Refusal, RefusalReason, Trouble, TroubleKind};
-use crate::drive::polarity_check::{Bounds, PATIENCE, PATIENCE_BY_HAND, Push, Sample, SignTest, Verdict};
+use crate::drive::polarity_check::{Bounds, PATIENCE, PATIENCE_BY_HAND, PolarityVerdict, Push, Sample, SignTest};
 use crate::drive::sdo_sequence::Watching;
 use crate::safety::{Protection, is_present};
 use abi::rig::{Kind, Mode, Rig, Signal, SignalKind};
@@ -145,7 +145,7 @@ pub enum Request {
 }
 
 #[derive(Clone, Debug)]
-enum Node {
+enum StartingNode {
     Drive(Box<Drive>),
     Device(Device),
 }
@@ -177,7 +177,7 @@ pub struct Fieldbus {
     names: Vec<String>,
     /// Bus of each node.
     places: Vec<usize>,
-    nodes: Vec<Node>,
+    nodes: Vec<StartingNode>,
     /// Whether a bus has CANopen nodes.
     canopen: Vec<bool>,
     stop_frames: Vec<Vec<Frame>>,
@@ -237,7 +237,7 @@ impl Fieldbus {
                         safe: outputs().next().map_or(0.0, |output| output.safe),
                         most: outputs().map(|output| output.high.min(-output.low)).fold(f64::INFINITY, f64::min),
                     };
-                    Drive::new(config, profile, setting).map(|drive| Node::Drive(Box::new(drive)))
+                    Drive::new(config, profile, setting).map(|drive| StartingNode::Drive(Box::new(drive)))
                 }
                 Kind::Frames(messages) => {
                     let safe: Vec<_> = outputs()
@@ -246,7 +246,7 @@ impl Fieldbus {
                             _ => None,
                         })
                         .collect();
-                    Device::new(messages, node.moves, &safe).map(Node::Device)
+                    Device::new(messages, node.moves, &safe).map(StartingNode::Device)
                 }
             };
             nodes.push(made.map_err(|error| format!("`{}`: {error}", node.name))?);
@@ -254,7 +254,7 @@ impl Fieldbus {
         let places: Vec<usize> = rig.nodes.iter().map(|node| node.bus).collect();
         let mut canopen = vec![false; rig.buses.len()];
         for (node, bus) in nodes.iter().zip(&places) {
-            canopen[*bus] |= matches!(node, Node::Drive(_));
+            canopen[*bus] |= matches!(node, StartingNode::Drive(_));
         }
         let mut fieldbus = Fieldbus {
             names: rig.nodes.iter().map(|node| node.name.clone()).collect(),
@@ -289,12 +289,12 @@ impl Fieldbus {
         for node in order {
             let bus = fieldbus.places[node];
             match &fieldbus.nodes[node] {
-                Node::Drive(drive) => {
+                StartingNode::Drive(drive) => {
                     let [stop, off] = drive.stop_frames();
                     fieldbus.stop_frames[bus].push(stop);
                     fieldbus.off_frames[bus].push(off);
                 }
-                Node::Device(device) => {
+                StartingNode::Device(device) => {
                     fieldbus.stop_frames[bus].extend(device.stop_frames());
                     fieldbus.off_frames[bus].extend(device.stop_frames());
                 }
@@ -332,8 +332,8 @@ impl Fieldbus {
         match node {
             None => what.to_string(),
             Some(node) => match &self.nodes[node] {
-                Node::Drive(drive) => format!("{} (node {}): {what}", self.names[node], drive.node()),
-                Node::Device(_) => format!("{}: {what}", self.names[node]),
+                StartingNode::Drive(drive) => format!("{} (node {}): {what}", self.names[node], drive.node()),
+                StartingNode::Device(_) => format!("{}: {what}", self.names[node]),
             },
         }
     }
@@ -366,9 +366,9 @@ impl Fieldbus {
     /// If the rig has no such signal: an error of the caller.
     pub fn reading(&self, signal: Signal) -> Reading {
         let reading = match (&self.nodes[signal.node], signal.what) {
-            (Node::Drive(drive), what) => drive.reading(what),
-            (Node::Device(device), SignalKind::Field(message, field)) => device.reading(message, field),
-            (Node::Device(_), _) => None,
+            (StartingNode::Drive(drive), what) => drive.reading(what),
+            (StartingNode::Device(device), SignalKind::Field(message, field)) => device.reading(message, field),
+            (StartingNode::Device(_), _) => None,
         };
         reading.unwrap_or_else(|| panic!("`{}` has no signal {:?}", self.names[signal.node], signal.what))
     }
@@ -376,18 +376,20 @@ impl Fieldbus {
     /// Whether a node has this signal.
     pub fn has(&self, signal: Signal) -> bool {
         match (&self.nodes[signal.node], signal.what) {
-            (Node::Drive(drive), what) => drive.reading(what).is_some(),
-            (Node::Device(device), SignalKind::Field(message, field)) => device.reading(message, field).is_some(),
-            (Node::Device(_), _) => false,
+            (StartingNode::Drive(drive), what) => drive.reading(what).is_some(),
+            (StartingNode::Device(device), SignalKind::Field(message, field)) => {
+                device.reading(message, field).is_some()
+            }
+            (StartingNode::Device(_), _) => false,
         }
     }
 
     /// Sets a command for the next [`end`](Fieldbus::end), SI. The supervisor must have permitted it.
     pub fn command(&mut self, signal: Signal, value: f64) {
         match (&mut self.nodes[signal.node], signal.what) {
-            (Node::Drive(drive), _) => drive.command(value),
-            (Node::Device(device), SignalKind::Field(message, field)) => device.command(message, field, value),
-            (Node::Device(_), _) => {}
+            (StartingNode::Drive(drive), _) => drive.command(value),
+            (StartingNode::Device(device), SignalKind::Field(message, field)) => device.command(message, field, value),
+            (StartingNode::Device(_), _) => {}
         }
     }
 
@@ -395,25 +397,25 @@ impl Fieldbus {
     /// 0 or the safe value.
     pub fn wanted(&self, signal: Signal) -> f64 {
         match (&self.nodes[signal.node], signal.what) {
-            (Node::Drive(_), _) => self.wanted[signal.node],
-            (Node::Device(device), SignalKind::Field(message, field)) => device.safe(message, field),
-            (Node::Device(_), _) => 0.0,
+            (StartingNode::Drive(_), _) => self.wanted[signal.node],
+            (StartingNode::Device(device), SignalKind::Field(message, field)) => device.safe(message, field),
+            (StartingNode::Device(_), _) => 0.0,
         }
     }
 
     /// Status of a drive; none for a device.
     pub fn status(&self, node: usize) -> Option<Status> {
         match &self.nodes[node] {
-            Node::Drive(drive) => Some(drive.status()),
-            Node::Device(_) => None,
+            StartingNode::Drive(drive) => Some(drive.status()),
+            StartingNode::Device(_) => None,
         }
     }
 
     /// Limits of a drive, zero before it is identified; none for a device.
     pub fn limits(&self, node: usize) -> Option<Limits> {
         match &self.nodes[node] {
-            Node::Drive(drive) => Some(drive.limits()),
-            Node::Device(_) => None,
+            StartingNode::Drive(drive) => Some(drive.limits()),
+            StartingNode::Device(_) => None,
         }
     }
 
@@ -438,8 +440,8 @@ impl Fieldbus {
                 }
             };
             match &mut self.nodes[at] {
-                Node::Drive(drive) => drive.receive(frame, stamp_ns, &mut tell, &mut |frame| send(bus, frame)),
-                Node::Device(device) => {
+                StartingNode::Drive(drive) => drive.receive(frame, stamp_ns, &mut tell, &mut |frame| send(bus, frame)),
+                StartingNode::Device(device) => {
                     owned |= device.owns(frame);
                     device.receive(frame, stamp_ns, &mut tell);
                 }
@@ -521,7 +523,7 @@ impl Fieldbus {
                 let goal = if request == Request::QuickStop { Goal::Stopped } else { Goal::Off };
                 self.aim(goal, false);
                 for node in &mut self.nodes {
-                    if let Node::Device(device) = node {
+                    if let StartingNode::Device(device) = node {
                         device.rest();
                     }
                 }
@@ -541,8 +543,8 @@ impl Fieldbus {
     pub fn begin(&mut self, send: Send) {
         for node in &mut self.nodes {
             match node {
-                Node::Drive(drive) => drive.begin(),
-                Node::Device(device) => device.begin(),
+                StartingNode::Drive(drive) => drive.begin(),
+                StartingNode::Device(device) => device.begin(),
             }
         }
         if self.running {
@@ -556,7 +558,7 @@ impl Fieldbus {
     pub fn end(&mut self, now_ns: u64, send: Send) {
         for at in 0..self.nodes.len() {
             let mut found = [None; 2];
-            if let Node::Drive(drive) = &mut self.nodes[at] {
+            if let StartingNode::Drive(drive) = &mut self.nodes[at] {
                 drive.watch(now_ns, &mut |kind| {
                     if let Some(place) = found.iter_mut().find(|place| place.is_none()) {
                         *place = Some(kind);
@@ -571,9 +573,9 @@ impl Fieldbus {
         for (node, bus) in self.nodes.iter_mut().zip(&self.places) {
             let mut send = |frame| send(*bus, frame);
             match node {
-                Node::Drive(drive) if running => drive.send_command(&mut send),
-                Node::Drive(_) => {}
-                Node::Device(device) => device.send_commands(now_ns, &mut send),
+                StartingNode::Drive(drive) if running => drive.send_command(&mut send),
+                StartingNode::Drive(_) => {}
+                StartingNode::Device(device) => device.send_commands(now_ns, &mut send),
             }
         }
         self.live(now_ns, send);
@@ -593,7 +595,7 @@ impl Fieldbus {
             }
         }
         for (node, bus) in self.nodes.iter_mut().zip(&self.places) {
-            if let Node::Drive(drive) = node {
+            if let StartingNode::Drive(drive) = node {
                 drive.guard(now_ns, &mut |frame| send(*bus, frame));
             }
         }
@@ -606,7 +608,7 @@ impl Fieldbus {
         mut work: impl FnMut(&mut Drive, crate::canopen::Send) -> Result<bool, RefusalReason>,
     ) -> bool {
         for at in 0..self.nodes.len() {
-            let Node::Drive(drive) = &mut self.nodes[at] else { continue };
+            let StartingNode::Drive(drive) = &mut self.nodes[at] else { continue };
             if self.done[at] {
                 continue;
             }
@@ -729,7 +731,7 @@ impl Fieldbus {
             return;
         }
         for at in 0..self.nodes.len() {
-            let Node::Drive(drive) = &self.nodes[at] else { continue };
+            let StartingNode::Drive(drive) = &self.nodes[at] else { continue };
             if !drive.disobeys() {
                 continue;
             }
@@ -800,7 +802,7 @@ impl Fieldbus {
         if all {
             for at in 0..self.nodes.len() {
                 let bus = self.places[at];
-                if let Node::Drive(drive) = &self.nodes[at]
+                if let StartingNode::Drive(drive) = &self.nodes[at]
                     && drive.nmt() != NmtState::Operational
                 {
                     send(bus, Nmt::Start.frame(drive.node()));
@@ -852,20 +854,20 @@ impl Fieldbus {
         let (at, holder) = (*at, *holder);
         let drive = drive_of(&self.nodes[at]).expect("found as one");
         match push.tick(sample(drive), self.period_ns as f64 * 1e-9) {
-            Verdict::Wants(command) => {
+            PolarityVerdict::Wants(command) => {
                 self.wanted[at] = command;
                 if let Some(holder) = holder {
                     self.wanted[holder] = drive_of(&self.nodes[holder]).map_or(0.0, turning);
                 }
             }
-            Verdict::Right => {
+            PolarityVerdict::Right => {
                 if let Some(holder) = holder {
                     self.wanted[holder] = 0.0;
                     self.returns_ns = lasted_ns + RETURN_NS;
                 }
                 (self.done[at], self.wanted[at], self.push) = (true, 0.0, None);
             }
-            Verdict::Wrong(why) => self.refuse(Some(at), why),
+            PolarityVerdict::Wrong(why) => self.refuse(Some(at), why),
         }
     }
 
@@ -907,16 +909,16 @@ fn bounds(drive: &Drive) -> Bounds {
     }
 }
 
-fn drive_of(node: &Node) -> Option<&Drive> {
+fn drive_of(node: &StartingNode) -> Option<&Drive> {
     match node {
-        Node::Drive(drive) => Some(drive),
-        Node::Device(_) => None,
+        StartingNode::Drive(drive) => Some(drive),
+        StartingNode::Device(_) => None,
     }
 }
 
-fn drive_of_mut(node: &mut Node) -> Option<&mut Drive> {
+fn drive_of_mut(node: &mut StartingNode) -> Option<&mut Drive> {
     match node {
-        Node::Drive(drive) => Some(drive),
-        Node::Device(_) => None,
+        StartingNode::Drive(drive) => Some(drive),
+        StartingNode::Device(_) => None,
     }
 }

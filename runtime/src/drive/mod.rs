@@ -1,7 +1,7 @@
 //! Drives: profiles of their kinds, the communication of a rig with them, and their simulation.
 //!
 //! In: a [`abi::rig::Rig`], frames, the time, permitted commands in SI. Out: frames, signals in SI with their ages, and
-//! reports of faults. A [`Fieldbus`] is the rig's side of all buses, a [`Bench`] the other side: simulated drives and
+//! reports of faults. A [`Fieldbus`] is the rig's side of all buses, a [`SimulatedBench`] the other side: simulated drives and
 //! devices on one shaft. Neither blocks, and neither decides how to react to a fault: the supervisor does.
 
 pub mod profiles;
@@ -25,7 +25,7 @@ pub use crate::drive::bus_stub::attend;
 pub use crate::drive::cia402::{Limits, Status};
 pub use crate::drive::fault_injection::{Effect, Hook, Start};
 pub use crate::drive::faults::{Reading, Refusal, RefusalReason, Trouble, TroubleKind};
-pub use crate::drive::simulated_plant::{Bench, Shaft};
+pub use crate::drive::simulated_plant::{Shaft, SimulatedBench};
 pub use fieldbus::{Fieldbus, Options, Request, Step};
 
 /// Callback that sends a frame: the bus (an index into [`abi::rig::Rig::buses`]) and the frame.

@@ -92,7 +92,7 @@ pub struct Push {
 
 /// Result of one tick.
 #[derive(Clone, Copy, PartialEq, Debug)]
-pub enum Verdict {
+pub enum PolarityVerdict {
     /// The check continues with this command, relative to rest.
     Wants(f64),
     /// The check has passed.
@@ -122,7 +122,7 @@ impl Push {
     }
 
     /// One tick of `dt` seconds.
-    pub fn tick(&mut self, sample: Sample, dt: f64) -> Verdict {
+    pub fn tick(&mut self, sample: Sample, dt: f64) -> PolarityVerdict {
         let start = *self.start.get_or_insert(sample.position);
         if self.phase == Phase::Calm {
             self.t += dt;
@@ -130,7 +130,7 @@ impl Push {
                 self.drift = (sample.position - start) / (self.t - dt);
                 (self.phase, self.t, self.start) = (Phase::Push, 0.0, Some(sample.position));
             }
-            return Verdict::Wants(0.0);
+            return PolarityVerdict::Wants(0.0);
         }
         // Relative to the position that the shaft would have without the push, continuing its earlier motion.
         self.start = Some(start + self.drift * dt);
@@ -144,19 +144,19 @@ impl Push {
         self.t += dt;
         let bounds = self.bounds;
         if self.turned.is_none() && (turned.abs() > bounds.angle_most || speed.abs() > bounds.speed_most) {
-            return Verdict::Wrong(RefusalReason::Ran(turned, speed));
+            return PolarityVerdict::Wrong(RefusalReason::Ran(turned, speed));
         }
         let patience = self.turned.unwrap_or(PATIENCE);
         let slope = bounds.command / RISE;
         match self.phase {
             Phase::Push if turned.abs() >= bounds.angle => {
                 if turned < 0.0 && self.turned.is_none() {
-                    return Verdict::Wrong(RefusalReason::WrongSign);
+                    return PolarityVerdict::Wrong(RefusalReason::WrongSign);
                 }
                 (self.phase, self.rise, self.t) = (Phase::Back, self.t, 0.0);
             }
             Phase::Push if self.t > patience => {
-                return Verdict::Wrong(match self.turned {
+                return PolarityVerdict::Wrong(match self.turned {
                     None => RefusalReason::Stuck(bounds.command),
                     Some(_) => RefusalReason::NotTurned(bounds.angle),
                 });
@@ -165,12 +165,12 @@ impl Push {
             // The motion has ended or reversed: friction has contributed.
             Phase::Back if self.t >= self.rise || turned < self.last => {
                 if let Some(why) = self.judge(turned, sample) {
-                    return Verdict::Wrong(why);
+                    return PolarityVerdict::Wrong(why);
                 }
                 (self.phase, self.t) = (Phase::Settle, 0.0);
             }
             Phase::Back => {}
-            Phase::Settle if self.t >= SETTLE => return Verdict::Right,
+            Phase::Settle if self.t >= SETTLE => return PolarityVerdict::Right,
             Phase::Calm | Phase::Settle => {}
         }
         self.last = turned;
@@ -189,7 +189,7 @@ impl Push {
             (Phase::Push, Mode::Position) => bounds.angle * 1.5,
             (Phase::Back | Phase::Settle, Mode::Position) => 0.0,
         };
-        Verdict::Wants(self.command)
+        PolarityVerdict::Wants(self.command)
     }
 
     /// Moment of inertia from impulse and angle of the push, whose torque rose linearly: x = ∫T dt · t / (3 J).
@@ -230,7 +230,7 @@ mod tests {
     };
 
     /// Simulates a shaft of 0.012 kg·m² with dry friction, with these factors on its readings.
-    fn run(bounds: Bounds, friction: f64, [torque, speed, position]: [f64; 3]) -> (Verdict, f64, f64) {
+    fn run(bounds: Bounds, friction: f64, [torque, speed, position]: [f64; 3]) -> (PolarityVerdict, f64, f64) {
         let (mut push, mut x, mut w, mut wanted) = (Push::new(bounds, None), 0.0f64, 0.0f64, 0.0);
         for _ in 0..5000 {
             for _ in 0..100 {
@@ -242,7 +242,7 @@ mod tests {
             }
             let sample = Sample { position: x * position, speed: Some(w * speed), torque: Some(wanted * torque.abs()) };
             match push.tick(sample, 1e-3) {
-                Verdict::Wants(command) => wanted = command,
+                PolarityVerdict::Wants(command) => wanted = command,
                 verdict => return (verdict, x, w),
             }
         }
@@ -253,29 +253,32 @@ mod tests {
     fn a_correct_shaft_passes_and_stops() {
         for friction in [0.0, 0.1, 0.4] {
             let (verdict, x, w) = run(BOUNDS, friction, [1.0; 3]);
-            assert_eq!(verdict, Verdict::Right, "friction {friction}");
+            assert_eq!(verdict, PolarityVerdict::Right, "friction {friction}");
             assert!(x.abs() < 0.05 && w.abs() < 0.05, "friction {friction}: {x} rad, {w} rad/s");
         }
     }
 
     #[test]
     fn wrong_signs_and_scales_are_reported() {
-        assert_eq!(run(BOUNDS, 0.1, [-1.0, 1.0, 1.0]).0, Verdict::Wrong(RefusalReason::WrongSign));
-        assert_eq!(run(BOUNDS, 0.1, [1.0, -1.0, -1.0]).0, Verdict::Wrong(RefusalReason::WrongSign));
+        assert_eq!(run(BOUNDS, 0.1, [-1.0, 1.0, 1.0]).0, PolarityVerdict::Wrong(RefusalReason::WrongSign));
+        assert_eq!(run(BOUNDS, 0.1, [1.0, -1.0, -1.0]).0, PolarityVerdict::Wrong(RefusalReason::WrongSign));
         for factor in [-1.0, 0.1, 10.0] {
             let (verdict, ..) = run(BOUNDS, 0.1, [1.0, factor, 1.0]);
-            assert!(matches!(verdict, Verdict::Wrong(RefusalReason::Scale(..))), "speed by {factor}: {verdict:?}");
+            assert!(
+                matches!(verdict, PolarityVerdict::Wrong(RefusalReason::Scale(..))),
+                "speed by {factor}: {verdict:?}"
+            );
         }
         let (verdict, ..) = run(BOUNDS, 0.1, [4.0, 1.0, 1.0]);
-        assert!(matches!(verdict, Verdict::Wrong(RefusalReason::Torque(..))), "{verdict:?}");
-        assert_eq!(run(BOUNDS, 2.0, [1.0; 3]).0, Verdict::Wrong(RefusalReason::Stuck(1.0)));
+        assert!(matches!(verdict, PolarityVerdict::Wrong(RefusalReason::Torque(..))), "{verdict:?}");
+        assert_eq!(run(BOUNDS, 2.0, [1.0; 3]).0, PolarityVerdict::Wrong(RefusalReason::Stuck(1.0)));
         // The shaft is to be turned from outside, but the drive does not see a motion.
         let mut turned = Push::new(BOUNDS, Some(0.5));
         let still = Sample { position: 1.0, speed: Some(0.0), torque: Some(0.0) };
-        let verdicts: Vec<Verdict> = (0..502).map(|_| turned.tick(still, 1e-3)).collect();
-        assert_eq!(verdicts[..499], [Verdict::Wants(0.0); 499]);
-        assert_eq!(verdicts[501], Verdict::Wrong(RefusalReason::NotTurned(BOUNDS.angle)));
+        let verdicts: Vec<PolarityVerdict> = (0..502).map(|_| turned.tick(still, 1e-3)).collect();
+        assert_eq!(verdicts[..499], [PolarityVerdict::Wants(0.0); 499]);
+        assert_eq!(verdicts[501], PolarityVerdict::Wrong(RefusalReason::NotTurned(BOUNDS.angle)));
         let tight = Bounds { speed_most: 0.01, ..BOUNDS };
-        assert!(matches!(run(tight, 0.0, [1.0; 3]).0, Verdict::Wrong(RefusalReason::Ran(..))));
+        assert!(matches!(run(tight, 0.0, [1.0; 3]).0, PolarityVerdict::Wrong(RefusalReason::Ran(..))));
     }
 }

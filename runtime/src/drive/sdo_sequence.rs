@@ -6,7 +6,7 @@ use crate::drive::faults::RefusalReason;
 
 /// One entry of a sequence.
 #[derive(Clone, Copy, PartialEq, Debug)]
-pub enum Entry {
+pub enum SequenceEntry {
     /// Reads a number and stores it.
     Read(Object, Type, Keep),
     /// The same, if the drive has the object.
@@ -94,7 +94,7 @@ const TRIES: u32 = 3;
 /// A sequence and its current entry.
 #[derive(Clone, Debug)]
 pub struct Script {
-    entries: Vec<Entry>,
+    entries: Vec<SequenceEntry>,
     at: usize,
     asked: bool,
     /// Number of attempts without an answer.
@@ -107,7 +107,7 @@ pub struct Script {
 
 impl Script {
     /// A sequence at its first entry.
-    pub fn new(entries: Vec<Entry>, timeout_ms: u32) -> Script {
+    pub fn new(entries: Vec<SequenceEntry>, timeout_ms: u32) -> Script {
         Script { entries, at: 0, asked: false, unanswered: 0, kept: [None; KEPT], timeout_ms }
     }
 
@@ -129,11 +129,11 @@ impl Script {
     pub fn work(&mut self, client: &mut Client, now_ns: u64, send: Send) -> Progress {
         let Some(&entry) = self.entries.get(self.at) else { return Progress::Done };
         match entry {
-            Entry::Judge(question) => {
+            SequenceEntry::Judge(question) => {
                 self.next(0);
                 return Progress::Asks(question);
             }
-            Entry::Skip(further) => {
+            SequenceEntry::Skip(further) => {
                 self.next(further);
                 return Progress::Busy;
             }
@@ -142,21 +142,21 @@ impl Script {
         if !self.asked {
             self.asked = true;
             match entry {
-                Entry::Read(object, ..)
-                | Entry::ReadIf(object, ..)
-                | Entry::TextIf(object, ..)
-                | Entry::Compare(object, ..)
-                | Entry::Watched(object, _) => {
+                SequenceEntry::Read(object, ..)
+                | SequenceEntry::ReadIf(object, ..)
+                | SequenceEntry::TextIf(object, ..)
+                | SequenceEntry::Compare(object, ..)
+                | SequenceEntry::Watched(object, _) => {
                     client.read(object, now_ns, send);
                 }
-                Entry::Write(object, value, size) | Entry::WriteOr(object, value, size, _) => {
+                SequenceEntry::Write(object, value, size) | SequenceEntry::WriteOr(object, value, size, _) => {
                     client.write(object, &value.to_le_bytes()[..size.into()], now_ns, send);
                 }
-                Entry::Watch(object, node, _) => {
+                SequenceEntry::Watch(object, node, _) => {
                     let value = u32::from(node) << 16 | self.timeout_ms;
                     client.write(object, &value.to_le_bytes(), now_ns, send);
                 }
-                Entry::Judge(_) | Entry::Skip(_) => unreachable!("handled above"),
+                SequenceEntry::Judge(_) | SequenceEntry::Skip(_) => unreachable!("handled above"),
             }
             return Progress::Busy;
         }
@@ -170,9 +170,9 @@ impl Script {
                     return Progress::Busy;
                 }
                 match entry {
-                    Entry::ReadIf(..) | Entry::TextIf(..) if aborted => self.next(0),
-                    Entry::WriteOr(.., further) if aborted => self.next(further),
-                    Entry::Watch(_, _, further) if aborted => {
+                    SequenceEntry::ReadIf(..) | SequenceEntry::TextIf(..) if aborted => self.next(0),
+                    SequenceEntry::WriteOr(.., further) if aborted => self.next(further),
+                    SequenceEntry::Watch(_, _, further) if aborted => {
                         if self.timeout_ms >= 1000 {
                             self.next(further);
                         } else {
@@ -181,7 +181,10 @@ impl Script {
                         }
                     }
                     _ => {
-                        let write = matches!(entry, Entry::Write(..) | Entry::WriteOr(..) | Entry::Watch(..));
+                        let write = matches!(
+                            entry,
+                            SequenceEntry::Write(..) | SequenceEntry::WriteOr(..) | SequenceEntry::Watch(..)
+                        );
                         return Progress::Refused(RefusalReason::Sdo { object: client.object(), write, failure });
                     }
                 }
@@ -190,28 +193,32 @@ impl Script {
         }
     }
 
-    fn take(&mut self, entry: Entry, data: &[u8]) -> Progress {
+    fn take(&mut self, entry: SequenceEntry, data: &[u8]) -> Progress {
         match entry {
-            Entry::Read(_, kind, keep) | Entry::ReadIf(_, kind, keep) => {
+            SequenceEntry::Read(_, kind, keep) | SequenceEntry::ReadIf(_, kind, keep) => {
                 self.kept[keep as usize] = Some(kind.number(data));
             }
-            Entry::TextIf(_, text, keep) => {
+            SequenceEntry::TextIf(_, text, keep) => {
                 // Some devices pad their texts with zeros.
                 let told = data.split(|byte| *byte == 0).next().unwrap_or_default();
                 self.kept[keep as usize] = Some((told == text.as_bytes()).into());
             }
-            Entry::Compare(object, wanted, bits) => {
+            SequenceEntry::Compare(object, wanted, bits) => {
                 if let Some(why) = differs(object, wanted & bits, Type::U64.number(data) & bits) {
                     return Progress::Refused(why);
                 }
             }
-            Entry::Watched(object, node) => {
+            SequenceEntry::Watched(object, node) => {
                 let wanted = i64::from(node) << 16 | i64::from(self.timeout_ms);
                 if let Some(why) = differs(object, wanted, Type::U64.number(data)) {
                     return Progress::Refused(why);
                 }
             }
-            Entry::Write(..) | Entry::WriteOr(..) | Entry::Watch(..) | Entry::Judge(_) | Entry::Skip(_) => {}
+            SequenceEntry::Write(..)
+            | SequenceEntry::WriteOr(..)
+            | SequenceEntry::Watch(..)
+            | SequenceEntry::Judge(_)
+            | SequenceEntry::Skip(_) => {}
         }
         self.next(0);
         Progress::Busy

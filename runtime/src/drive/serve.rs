@@ -12,7 +12,7 @@ use crate::can::slcan::Slcan;
 use crate::can::socketcand::Server;
 use crate::canopen::eds;
 use crate::drive::fault_injection;
-use crate::drive::simulated_plant::Bench;
+use crate::drive::simulated_plant::SimulatedBench;
 use crate::realtime::clock::Clock;
 use crate::realtime::threads::{self, Wishes};
 use abi::Instance;
@@ -70,7 +70,7 @@ pub struct Served {
     buses: Vec<SimBus>,
     hubs: Vec<Hub>,
     server: Option<Server>,
-    bench: Bench,
+    bench: SimulatedBench,
     joined: Vec<String>,
 }
 
@@ -94,7 +94,7 @@ impl Served {
             };
             addresses[at].1 = address;
         }
-        let mut bench = Bench::new(rig, plant, doors.seed).map_err(failed)?;
+        let mut bench = SimulatedBench::new(rig, plant, doors.seed).map_err(failed)?;
         for Sheet { drive, file, text } in &doors.sheets {
             let at = rig.nodes.iter().position(|node| node.name == *drive);
             let Some((at, Kind::Cia402(config))) = at.map(|at| (at, &rig.nodes[at].kind)) else {

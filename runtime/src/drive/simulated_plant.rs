@@ -71,7 +71,7 @@ struct Link {
 
 /// All nodes of a rig on their shaft.
 #[derive(Clone)]
-pub struct Bench {
+pub struct SimulatedBench {
     buses: Vec<usize>,
     bodies: Vec<Body>,
     shafts: Vec<Shaft>,
@@ -92,12 +92,12 @@ pub struct Bench {
     hooks: Vec<Armed>,
 }
 
-impl Bench {
+impl SimulatedBench {
     /// The nodes of a rig. `plant`: the program of the part that hardware replaces, before its start; without one each
     /// drive turns a shaft of its own that reaches 1000 rad/s² at rated torque. `seed`: for the initial counts of the
     /// encoders.
-    pub fn new(rig: &Rig, plant: Option<Instance>, seed: u64) -> Result<Bench, String> {
-        Bench::with(rig, plant, seed, |_| Behaviour::default())
+    pub fn new(rig: &Rig, plant: Option<Instance>, seed: u64) -> Result<SimulatedBench, String> {
+        SimulatedBench::with(rig, plant, seed, |_| Behaviour::default())
     }
 
     /// The same, with a behaviour for each drive (index into the rig's nodes).
@@ -106,7 +106,7 @@ impl Bench {
         mut plant: Option<Instance>,
         seed: u64,
         behaviour: impl Fn(usize) -> Behaviour,
-    ) -> Result<Bench, String> {
+    ) -> Result<SimulatedBench, String> {
         let step_ns = (rig.period_ns / STEPS).clamp(1, STEP_NS);
         let mut status = 0;
         if let Some(plant) = &mut plant {
@@ -157,7 +157,7 @@ impl Bench {
             };
             rig.plant.applied.iter().any(|(signal, _)| held(signal))
         };
-        let mut bench = Bench {
+        let mut bench = SimulatedBench {
             buses: rig.nodes.iter().map(|node| node.bus).collect(),
             shafts: vec![Shaft::default(); bodies.len()],
             bodies,
@@ -186,7 +186,7 @@ impl Bench {
 
     /// The same with other steps of the shaft, ns, before any time has passed: coarse steps for very many runs.
     #[cfg(test)]
-    pub fn in_steps_of(mut self, step_ns: u64) -> Bench {
+    pub fn in_steps_of(mut self, step_ns: u64) -> SimulatedBench {
         assert_eq!(self.count, 0, "the shaft has turned already");
         self.step_ns = step_ns;
         if let Some(plant) = &mut self.plant {

@@ -136,7 +136,7 @@ pub fn towards(goal: Goal, state: State, reset: bool) -> u16 {
 
 /// A command, as encoded by the lower bits of a control word.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
-enum Command {
+enum ControlCommand {
     Shutdown,
     SwitchOn,
     Enable,
@@ -144,14 +144,14 @@ enum Command {
     DisableVoltage,
 }
 
-impl Command {
-    fn of(word: u16) -> Command {
+impl ControlCommand {
+    fn of(word: u16) -> ControlCommand {
         match word & 0x0F {
-            word if word & 0x02 == 0 => Command::DisableVoltage,
-            word if word & 0x04 == 0 => Command::QuickStop,
-            word if word & 0x01 == 0 => Command::Shutdown,
-            word if word & 0x08 == 0 => Command::SwitchOn,
-            _ => Command::Enable,
+            word if word & 0x02 == 0 => ControlCommand::DisableVoltage,
+            word if word & 0x04 == 0 => ControlCommand::QuickStop,
+            word if word & 0x01 == 0 => ControlCommand::Shutdown,
+            word if word & 0x08 == 0 => ControlCommand::SwitchOn,
+            _ => ControlCommand::Enable,
         }
     }
 }
@@ -223,7 +223,7 @@ impl Machine {
         let edge = word & !self.word & control::FAULT_RESET != 0;
         self.word = word;
         let times = self.times;
-        match (self.state, Command::of(word)) {
+        match (self.state, ControlCommand::of(word)) {
             (State::Fault, _) => {
                 if edge && cleared {
                     self.go(State::SwitchOnDisabled, times.start_ns, now_ns); // transition 15
@@ -231,30 +231,32 @@ impl Machine {
                 }
             }
             (State::NotReady | State::FaultReaction, _) => {}
-            (State::SwitchOnDisabled, Command::Shutdown) => self.go(State::Ready, 0, now_ns), // 2
+            (State::SwitchOnDisabled, ControlCommand::Shutdown) => self.go(State::Ready, 0, now_ns), // 2
             (State::SwitchOnDisabled, _) => {}
-            (State::Ready, Command::SwitchOn | Command::Enable) => {
+            (State::Ready, ControlCommand::SwitchOn | ControlCommand::Enable) => {
                 self.go(State::SwitchedOn, times.switch_on_ns, now_ns); // 3
             }
-            (State::SwitchedOn, Command::Enable) => self.go(State::Enabled, times.enable_ns, now_ns), // 4
-            (State::Enabled, Command::SwitchOn) => self.go(State::SwitchedOn, times.disable_ns, now_ns), // 5
-            (State::SwitchedOn | State::Enabled, Command::Shutdown) => {
+            (State::SwitchedOn, ControlCommand::Enable) => self.go(State::Enabled, times.enable_ns, now_ns), // 4
+            (State::Enabled, ControlCommand::SwitchOn) => self.go(State::SwitchedOn, times.disable_ns, now_ns), // 5
+            (State::SwitchedOn | State::Enabled, ControlCommand::Shutdown) => {
                 let after = if self.state == State::Enabled { times.disable_ns } else { 0 };
                 self.go(State::Ready, after, now_ns); // 6, 8
             }
-            (State::Ready | State::SwitchedOn, Command::QuickStop | Command::DisableVoltage)
-            | (State::Enabled | State::QuickStop, Command::DisableVoltage) => {
+            (State::Ready | State::SwitchedOn, ControlCommand::QuickStop | ControlCommand::DisableVoltage)
+            | (State::Enabled | State::QuickStop, ControlCommand::DisableVoltage) => {
                 self.go(State::SwitchOnDisabled, 0, now_ns); // 7, 9, 10, 12
             }
-            (State::Enabled, Command::QuickStop) if self.quick_stop_option == 0 => {
+            (State::Enabled, ControlCommand::QuickStop) if self.quick_stop_option == 0 => {
                 self.go(State::SwitchOnDisabled, 0, now_ns);
             }
-            (State::Enabled, Command::QuickStop) => self.go(State::QuickStop, 0, now_ns), // 11
-            (State::QuickStop, Command::Enable) if self.quick_stop_option >= 5 => self.go(State::Enabled, 0, now_ns), // 16
+            (State::Enabled, ControlCommand::QuickStop) => self.go(State::QuickStop, 0, now_ns), // 11
+            (State::QuickStop, ControlCommand::Enable) if self.quick_stop_option >= 5 => {
+                self.go(State::Enabled, 0, now_ns)
+            } // 16
             // A command to stay, or one without meaning in this state, cancels a transition in progress.
-            (State::Ready, Command::Shutdown)
-            | (State::SwitchedOn, Command::SwitchOn)
-            | (State::Enabled, Command::Enable) => self.pending = None,
+            (State::Ready, ControlCommand::Shutdown)
+            | (State::SwitchedOn, ControlCommand::SwitchOn)
+            | (State::Enabled, ControlCommand::Enable) => self.pending = None,
             (State::QuickStop, _) => {}
         }
         false

@@ -14,7 +14,7 @@ fn table(rig: &Rig) -> Table {
     Table::new(rig, Some(shaft(0.012, 0.001)), Options::default())
 }
 
-fn with(change: impl FnOnce(&mut Bench)) -> Table {
+fn with(change: impl FnOnce(&mut SimulatedBench)) -> Table {
     let rig = rig(Mode::Torque);
     let mut table = table(&rig);
     change(&mut table.bench);
@@ -118,7 +118,7 @@ fn torque_mode_4_has_the_rigs_slope() {
     let mut rig = rig(Mode::Torque);
     rig.outputs[SERVO].slew = 20.0;
     let only_4 = Behaviour { modes: Some(0b1000), ..Behaviour::default() };
-    let bench = Bench::with(&rig, Some(shaft(0.012, 0.001)), 7, |_| only_4).unwrap();
+    let bench = SimulatedBench::with(&rig, Some(shaft(0.012, 0.001)), 7, |_| only_4).unwrap();
     let mut table = Table::with(&rig, bench, Options::default());
     table.arm();
     assert_eq!(table.fieldbus.status(SERVO).unwrap().mode, 4);
@@ -189,7 +189,7 @@ fn wrong_drives_are_refused_with_a_message() {
         "load (node 3): object 1600:02 could not be written: object cannot be mapped to the PDO (abort code 0x06040041)"
     );
     let mut nobody = rig(Mode::Torque);
-    let mut bench = Bench::new(&nobody, None, 1).unwrap();
+    let mut bench = SimulatedBench::new(&nobody, None, 1).unwrap();
     config(&mut nobody, LOAD).node = 9;
     assert_eq!(
         Table::with(&nobody, bench.clone(), Options::default()).refused(),
@@ -533,7 +533,7 @@ fn two_drives_start_up_over_a_bus() {
     let simulation = Simulation::new();
     let bus = simulation.bus("can0", 1_000_000);
     let mut master = bus.port("fric");
-    let bench = Bench::new(&rig, Some(shaft(0.012, 0.001)), 7).unwrap();
+    let bench = SimulatedBench::new(&rig, Some(shaft(0.012, 0.001)), 7).unwrap();
     let bench = attend(&simulation, &[bus], &rig, bench);
     let mut fieldbus = Fieldbus::new(&rig, Options::default()).unwrap();
     let (mut tick, mut late) = (0, 0);

@@ -8,7 +8,7 @@ use super::control;
 use super::cycle::{Command, End, Hil, Operator, Options, look_ahead};
 use super::live::Set;
 use super::simulated::{BENCH, MASTER, Pace, World};
-use crate::can::sim::{Fault, Kind as FaultKind, Port};
+use crate::can::sim::{BusFaultKind as FaultKind, Fault, Port};
 use crate::can::{Bus, Frame};
 use crate::drive::fault_injection::{self, Effect, Hook, Start};
 use crate::drive::polarity_check::SignTest;

@@ -10,7 +10,7 @@ use super::cycle::{End, Hil, look_ahead};
 use super::simulated::{Pace, World};
 use crate::drive::Step;
 use crate::drive::fault_injection::{Effect, Hook, Start};
-use crate::drive::simulated_plant::Bench;
+use crate::drive::simulated_plant::SimulatedBench;
 use crate::realtime::clock::Clock;
 use crate::rng::Chance;
 use crate::safety::Cause;
@@ -57,7 +57,7 @@ enum Event {
 
 /// Parameters of one run.
 #[derive(Clone, Copy, PartialEq, Debug)]
-struct Script {
+struct ContactScript {
     seed: u64,
     /// True moment of inertia and that of the rig's text, kg·m².
     inertia: f64,
@@ -82,8 +82,8 @@ struct Script {
     after: u64,
 }
 
-impl Script {
-    fn of(seed: u64) -> Script {
+impl ContactScript {
+    fn of(seed: u64) -> ContactScript {
         let mut chance = Chance(seed);
         let log = |chance: &mut Chance, low: f64, high: f64| low * (high / low).powf(chance.fraction());
         let inertia = log(&mut chance, 0.004, 0.04);
@@ -97,7 +97,7 @@ impl Script {
             _ => Event::Nothing,
         };
         let most = chance.between(0.1, 0.6);
-        Script {
+        ContactScript {
             seed,
             inertia,
             told,
@@ -119,7 +119,7 @@ impl Script {
 
     /// Rig, control program, plant program. `at`: time of the event, s.
     fn build(&self, at: f64) -> (Rig, Instance, Instance) {
-        let Script { inertia, bearings, stiffness, most, damping, swing, hertz, event, .. } = *self;
+        let ContactScript { inertia, bearings, stiffness, most, damping, swing, hertz, event, .. } = *self;
         let (mut rig, _, _) = rigs::bristle();
         let control = Model::new("Bristle")
             .inputs(2)
@@ -231,7 +231,7 @@ impl Energies {
 
 /// Outcome of a run.
 #[derive(Clone, Copy, Debug, Default)]
-struct Shown {
+struct ContactOutcome {
     warned: bool,
     energy_stop: bool,
     unpredicted: bool,
@@ -243,10 +243,10 @@ struct Shown {
 ///
 /// # Errors
 /// A violated property.
-fn run(script: &Script) -> Result<Shown, String> {
+fn run(script: &ContactScript) -> Result<ContactOutcome, String> {
     // The start-up takes the same time in both runs, so a first run measures it.
     let armed_ns = {
-        let (mut hil, world, _) = started(&Script { event: Event::Nothing, ..*script }, f64::INFINITY);
+        let (mut hil, world, _) = started(&ContactScript { event: Event::Nothing, ..*script }, f64::INFINITY);
         while hil.ended().is_none() && hil.counts().cycles == 0 {
             hil.cycle();
         }
@@ -265,7 +265,7 @@ fn run(script: &Script) -> Result<Shown, String> {
     let speed_slot = speed_slot.expect("the contact reads the speed of its drive").slot;
     let Kind::Cia402(load) = &rig.nodes[0].kind else { unreachable!("the load is a drive") };
     let count = load.count;
-    let mut shown = Shown::default();
+    let mut shown = ContactOutcome::default();
     let mut energies = Energies::default();
     let (mut unpredicted, mut warnings) = (0, VecDeque::from([(0u64, 0u64)]));
     // Deadlines for the reactions.
@@ -376,13 +376,13 @@ fn run(script: &Script) -> Result<Shown, String> {
 }
 
 /// The rig of a script before its start.
-fn started(script: &Script, at: f64) -> (Hil, World, Rig) {
+fn started(script: &ContactScript, at: f64) -> (Hil, World, Rig) {
     let (rig, control, plant) = script.build(at);
     let mut options = quick();
     options.control.needs_look = script.needs_look;
     options.control.energy_stops = script.energy_stops;
     options.look = look_ahead(&rig, &plant).unwrap();
-    let bench = Bench::new(&rig, Some(plant), script.seed).unwrap().in_steps_of(STEP_NS);
+    let bench = SimulatedBench::new(&rig, Some(plant), script.seed).unwrap().in_steps_of(STEP_NS);
     let mut world = World::around(&rig, bench, Pace::Fast, script.seed).unwrap();
     let masters = world.masters();
     let (hil, _) = Hil::new(&rig, control, world.clock(), masters, options, None).unwrap();
@@ -391,8 +391,8 @@ fn started(script: &Script, at: f64) -> (Hil, World, Rig) {
 }
 
 /// Simplifies a failing script while it still fails.
-fn shrunk(script: &Script, why: String) -> (Script, String) {
-    let changes: [fn(&mut Script); 8] = [
+fn shrunk(script: &ContactScript, why: String) -> (ContactScript, String) {
+    let changes: [fn(&mut ContactScript); 8] = [
         |script| script.event = Event::Nothing,
         |script| script.told = script.inertia,
         |script| script.bearings = 0.0,
@@ -410,10 +410,16 @@ fn model_deviations_and_active_contacts_are_detected_in_time() {
     let seeds = seeds(RUNS);
     let all = seeds.end - seeds.start;
     let mut kinds = [0; 5];
-    let failed = hold(seeds, Script::of, run, shrunk, |Shown { warned, energy_stop, unpredicted, needed, quiet }| {
-        let shown = [warned, energy_stop, unpredicted, needed, quiet];
-        kinds.iter_mut().zip(shown).for_each(|(count, shown)| *count += u64::from(shown));
-    });
+    let failed = hold(
+        seeds,
+        ContactScript::of,
+        run,
+        shrunk,
+        |ContactOutcome { warned, energy_stop, unpredicted, needed, quiet }| {
+            let shown = [warned, energy_stop, unpredicted, needed, quiet];
+            kinds.iter_mut().zip(shown).for_each(|(count, shown)| *count += u64::from(shown));
+        },
+    );
     let [warned, stopped, unpredicted, needed, quiet] = kinds;
     println!(
         "{all} runs: {warned} had to warn, {stopped} stopped for energy, {unpredicted} were not as told, {needed} of them \

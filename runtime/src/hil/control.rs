@@ -4,7 +4,7 @@
 //! drive command. Knows neither clock nor bus nor file, so a replay of the same inputs reproduces every bit. It
 //! allocates only in [`Control::new`].
 
-use super::coupling::{Coupling, Verdict};
+use super::coupling::{Coupling, CouplingVerdict};
 use super::followed::Followed;
 use super::watches::{self, Bounds, bounds_of};
 use crate::coupling::predictor::Wired;
@@ -548,9 +548,9 @@ impl Control {
         let read = |at: usize| (watched[at].last, watched[at].since == Some(0));
         let (ahead, verdict) = self.coupling.read(told.ticks, told.late_ns, read);
         match verdict {
-            Verdict::Fine => {}
-            Verdict::Drives => self.supervisor.trip(Cause::Energy),
-            Verdict::Unpredictable => self.supervisor.trip(Cause::Unpredictable),
+            CouplingVerdict::Fine => {}
+            CouplingVerdict::Drives => self.supervisor.trip(Cause::Energy),
+            CouplingVerdict::Unpredictable => self.supervisor.trip(Cause::Unpredictable),
         }
         if let (Some(ahead), Some(node)) = (ahead, self.coupling.looks_ahead()) {
             for (at, slot) in &self.inputs {

@@ -28,7 +28,7 @@ pub struct Counts {
 
 /// Result of the checks of one cycle.
 #[derive(Clone, Copy, PartialEq, Debug)]
-pub enum Verdict {
+pub enum CouplingVerdict {
     /// The run may continue.
     Fine,
     /// The contact drives the shaft: it returns too much energy.
@@ -157,12 +157,17 @@ impl Coupling {
     }
 
     /// One cycle, `ticks` after the last one and begun `late_ns` after its tick. `read`: reading of each signal.
-    pub fn read(&mut self, ticks: u32, late_ns: u32, read: impl Fn(usize) -> Read) -> (Option<Predicted>, Verdict) {
+    pub fn read(
+        &mut self,
+        ticks: u32,
+        late_ns: u32,
+        read: impl Fn(usize) -> Read,
+    ) -> (Option<Predicted>, CouplingVerdict) {
         self.now_ns += u64::from(ticks) * self.period_ns;
         let ahead = self.look(self.now_ns + u64::from(late_ns), read(self.position));
         let lost = self.look.is_some() && ahead.is_none();
         self.counts.unpredicted += u64::from(lost);
-        let mut verdict = if lost && self.needs_look { Verdict::Unpredictable } else { Verdict::Fine };
+        let mut verdict = if lost && self.needs_look { CouplingVerdict::Unpredictable } else { CouplingVerdict::Fine };
         for contact in &mut self.contacts {
             let torque = read(contact.torque).0;
             let other = self.torques.iter().filter(|at| **at != contact.torque).map(|at| read(*at).0).sum();
@@ -171,7 +176,7 @@ impl Coupling {
             self.counts.warnings += u64::from(sign > Sign::Healthy);
             self.counts.returned_max = self.counts.returned_max.max(contact.energy.returned());
             if sign == Sign::Trip && self.stops {
-                verdict = Verdict::Drives;
+                verdict = CouplingVerdict::Drives;
             }
         }
         (ahead, verdict)
@@ -312,15 +317,15 @@ mod tests {
         for stops in [false, true] {
             let mut coupling = Coupling::new(&rig, None, &WATCHED, &model);
             coupling.stops_for(false, stops);
-            let mut worst = Verdict::Fine;
+            let mut worst = CouplingVerdict::Fine;
             // 0.3 N·m in the direction of motion for 20 ms at 1 rad/s: 6 mJ, while the contact can store 0.22 mJ.
             for _ in 0..20 {
                 let (_, verdict) = coupling.read(1, 0, |at| ([1.0, 0.3, 0.0][at], true));
-                if verdict != Verdict::Fine {
+                if verdict != CouplingVerdict::Fine {
                     worst = verdict;
                 }
             }
-            assert_eq!(worst, if stops { Verdict::Drives } else { Verdict::Fine });
+            assert_eq!(worst, if stops { CouplingVerdict::Drives } else { CouplingVerdict::Fine });
             assert!(coupling.counts().warnings > 10 && coupling.counts().returned_max > 20.0);
         }
     }

@@ -103,7 +103,7 @@ pub struct Gauges {
 /// A running rig.
 pub struct Hil {
     /// Declared before the buses: the stop frames must be withdrawn before their descriptors close.
-    table: Option<emergency::Table>,
+    table: Option<emergency::EmergencyTable>,
     rig: Rig,
     options: Options,
     wires: Wires,

@@ -47,7 +47,7 @@ enum Ill {
 
 /// Parameters of one run.
 #[derive(Clone, PartialEq, Debug)]
-struct Script {
+struct DiskScript {
     seed: u64,
     /// Faults, each with the write from which it acts, in order.
     ills: Vec<(u64, Ill)>,
@@ -61,8 +61,8 @@ struct Script {
     fails: bool,
 }
 
-impl Script {
-    fn of(seed: u64) -> Script {
+impl DiskScript {
+    fn of(seed: u64) -> DiskScript {
         let mut chance = Chance(seed);
         let ill = |chance: &mut Chance| match chance.below(8) {
             0..=2 => Ill::Stalls(1 + chance.below(600)),
@@ -75,7 +75,7 @@ impl Script {
         let ills = (0..[0, 1, 1, 2, 3][chance.below(5) as usize]).map(|_| (chance.below(60), ill(&mut chance)));
         let mut ills: Vec<(u64, Ill)> = ills.collect();
         ills.sort_by_key(|(at, _)| *at);
-        Script {
+        DiskScript {
             seed,
             ills,
             queue: [600, 3_000, 20_000][chance.below(3) as usize],
@@ -89,7 +89,7 @@ impl Script {
 
 /// State shared by the disk and the test.
 #[derive(Default)]
-struct Shared {
+struct SharedDisk {
     /// Number of cycles that have passed; the maximum once the run is over.
     cycles: u64,
     /// Number of writes.
@@ -100,7 +100,7 @@ struct Shared {
 }
 
 #[derive(Clone, Default)]
-struct Faulty(Arc<(Mutex<Shared>, Condvar)>);
+struct Faulty(Arc<(Mutex<SharedDisk>, Condvar)>);
 
 impl Faulty {
     fn pass(&self, cycles: u64) {
@@ -162,7 +162,7 @@ impl Disk for Faulty {
         if number > 1 && self.wrong(|ill| matches!(ill, Ill::Sealed(_)), sealed).is_some() {
             return Err(ErrorKind::ReadOnlyFilesystem.into());
         }
-        Ok(Box::new(Part { disk: self.clone(), file: System.create(first, number)? }))
+        Ok(Box::new(DiskPart { disk: self.clone(), file: System.create(first, number)? }))
     }
 
     fn free(&self, path: &Path) -> io::Result<u64> {
@@ -176,12 +176,12 @@ impl Disk for Faulty {
     }
 }
 
-struct Part {
+struct DiskPart {
     disk: Faulty,
     file: Box<dyn Write + Send>,
 }
 
-impl Write for Part {
+impl Write for DiskPart {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
         self.disk.0.0.lock().unwrap().writes += 1;
         self.disk.stall();
@@ -240,7 +240,7 @@ struct Fate {
 ///
 /// # Errors
 /// A violated property.
-fn run(script: &Script) -> Result<Fate, String> {
+fn run(script: &DiskScript) -> Result<Fate, String> {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("rig.friclog");
     let disk = Faulty::default();
@@ -342,19 +342,19 @@ fn run(script: &Script) -> Result<Fate, String> {
 }
 
 /// Simplifies a failing script while it still fails.
-fn shrunk(script: &Script, why: String) -> (Script, String) {
-    let simpler = |best: &Script| {
-        let mut smaller: Vec<Script> = (0..best.ills.len())
+fn shrunk(script: &DiskScript, why: String) -> (DiskScript, String) {
+    let simpler = |best: &DiskScript| {
+        let mut smaller: Vec<DiskScript> = (0..best.ills.len())
             .map(|at| {
                 let mut other = best.clone();
                 other.ills.remove(at);
                 other
             })
             .collect();
-        smaller.push(Script { part: 1 << 40, ..best.clone() });
-        smaller.push(Script { queue: 20_000, ..best.clone() });
-        smaller.push(Script { fails: false, ..best.clone() });
-        smaller.push(Script { cycles: best.cycles / 2, ..best.clone() });
+        smaller.push(DiskScript { part: 1 << 40, ..best.clone() });
+        smaller.push(DiskScript { queue: 20_000, ..best.clone() });
+        smaller.push(DiskScript { fails: false, ..best.clone() });
+        smaller.push(DiskScript { cycles: best.cycles / 2, ..best.clone() });
         smaller.retain(|other| other.cycles > 50);
         smaller
     };
@@ -366,7 +366,7 @@ fn each_message_is_logged_or_counted_for_any_disk_fault() {
     let seeds = seeds(RUNS);
     let all = seeds.end - seeds.start;
     let (mut dropped, mut broken, mut rolled, mut skipped) = (0, 0, 0, 0);
-    let failed = hold(seeds, Script::of, run, shrunk, |fate| {
+    let failed = hold(seeds, DiskScript::of, run, shrunk, |fate| {
         dropped += u64::from(fate.dropped > 0 && !fate.broken);
         broken += u64::from(fate.broken);
         rolled += u64::from(fate.parts > 1);

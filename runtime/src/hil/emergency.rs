@@ -28,9 +28,9 @@ static SENDING: AtomicU32 = AtomicU32::new(0);
 /// An active table, until this is dropped. The buses that made its frames must outlive it: it holds their descriptors,
 /// and after them the same numbers may belong to any file.
 #[derive(Debug)]
-pub struct Table(*mut Vec<Prepared>);
+pub struct EmergencyTable(*mut Vec<Prepared>);
 
-impl Drop for Table {
+impl Drop for EmergencyTable {
     fn drop(&mut self) {
         if !is_present(Protection::Table) {
             return;
@@ -45,10 +45,10 @@ impl Drop for Table {
 }
 
 /// Activates a table of frames.
-pub fn prepare(frames: Vec<Prepared>) -> Table {
+pub fn prepare(frames: Vec<Prepared>) -> EmergencyTable {
     let table = Box::into_raw(Box::new(frames));
     TABLE.store(table, Ordering::SeqCst);
-    Table(table)
+    EmergencyTable(table)
 }
 
 /// Sends the table three times, because a frame may be lost. Calls only write(2), so it is safe in any thread or
@@ -162,7 +162,7 @@ struct Shared {
 
 /// Decision of the watchdog at some moment.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
-enum Look {
+enum WatchdogDecision {
     /// Its time-out has passed: it acts.
     Bites,
     /// It waits for this time, ns.
@@ -171,13 +171,13 @@ enum Look {
 
 /// Decision at `now_ns`; `beat_ns`: end of the last cycle; `bitten_ns`: the beat after which the watchdog has already
 /// acted.
-fn look(now_ns: u64, beat_ns: u64, awake: bool, bitten_ns: u64, patience_ns: u64) -> Look {
+fn look(now_ns: u64, beat_ns: u64, awake: bool, bitten_ns: u64, patience_ns: u64) -> WatchdogDecision {
     let left = (beat_ns + patience_ns).saturating_sub(now_ns);
     match left {
-        0 if awake && beat_ns > 0 && beat_ns != bitten_ns => Look::Bites,
+        0 if awake && beat_ns > 0 && beat_ns != bitten_ns => WatchdogDecision::Bites,
         // A later beat cannot time out before this.
-        0 => Look::Waits(patience_ns),
-        left => Look::Waits(left),
+        0 => WatchdogDecision::Waits(patience_ns),
+        left => WatchdogDecision::Waits(left),
     }
 }
 
@@ -201,14 +201,14 @@ impl Watchdog {
                 let beat_ns = watching.beat_ns.load(Ordering::Acquire);
                 let awake = watching.awake.load(Ordering::Acquire);
                 match look(clock.now_ns(), beat_ns, awake, bitten_ns, patience_ns) {
-                    Look::Bites => {
+                    WatchdogDecision::Bites => {
                         bitten_ns = beat_ns;
                         if is_present(Protection::Bites) {
                             watching.bitten.store(true, Ordering::Release);
                             stop();
                         }
                     }
-                    Look::Waits(ns) => std::thread::park_timeout(Duration::from_nanos(ns)),
+                    WatchdogDecision::Waits(ns) => std::thread::park_timeout(Duration::from_nanos(ns)),
                 }
             }
         })?;
@@ -332,19 +332,21 @@ mod tests {
             let beat_ns = beat * 997;
             // Whenever it was woken before, it checks again no later than the time-out of this beat, and acts then.
             for woken_ns in [beat_ns, beat_ns + 1, beat_ns + patience / 3, beat_ns + patience - 1] {
-                let Look::Waits(ns) = look(woken_ns, beat_ns, true, 0, patience) else { panic!("too early: {beat}") };
+                let WatchdogDecision::Waits(ns) = look(woken_ns, beat_ns, true, 0, patience) else {
+                    panic!("too early: {beat}")
+                };
                 assert_eq!(woken_ns + ns, beat_ns + patience);
             }
-            assert_eq!(look(beat_ns + patience, beat_ns, true, 0, patience), Look::Bites);
-            assert_eq!(look(beat_ns + patience, beat_ns, false, 0, patience), Look::Waits(patience));
+            assert_eq!(look(beat_ns + patience, beat_ns, true, 0, patience), WatchdogDecision::Bites);
+            assert_eq!(look(beat_ns + patience, beat_ns, false, 0, patience), WatchdogDecision::Waits(patience));
             assert_eq!(
                 look(beat_ns + patience, beat_ns, true, beat_ns, patience),
-                Look::Waits(patience),
+                WatchdogDecision::Waits(patience),
                 "once a beat"
             );
         }
-        assert_eq!(look(77, 0, true, 0, patience), Look::Waits(patience - 77), "before the first beat");
-        assert_eq!(look(patience, 0, true, 0, patience), Look::Waits(patience), "before the first beat");
+        assert_eq!(look(77, 0, true, 0, patience), WatchdogDecision::Waits(patience - 77), "before the first beat");
+        assert_eq!(look(patience, 0, true, 0, patience), WatchdogDecision::Waits(patience), "before the first beat");
     }
 
     /// An endless recursion of the cycle; `FRIC_OVERFLOW` names the file for its stop frames.

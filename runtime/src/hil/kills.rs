@@ -12,7 +12,7 @@ use crate::can::sim::Simulation;
 use crate::can::socketcand::Server;
 use crate::can::{self, socketcand};
 use crate::drive::attend;
-use crate::drive::simulated_plant::Bench;
+use crate::drive::simulated_plant::SimulatedBench;
 use crate::drive::state::State;
 use crate::realtime::clock::Clock;
 use crate::rng::Chance;
@@ -46,7 +46,7 @@ enum Moment {
 
 /// Parameters of one run.
 #[derive(Clone, Copy, PartialEq, Debug)]
-struct Script {
+struct KillScript {
     seed: u64,
     period_ns: u64,
     watchdog_ns: u64,
@@ -55,14 +55,14 @@ struct Script {
     moment: Moment,
 }
 
-impl Script {
-    fn of(seed: u64) -> Script {
+impl KillScript {
+    fn of(seed: u64) -> KillScript {
         let mut chance = Chance(seed);
         let moment = match chance.below(4) {
             0 => Moment::Starting(chance.below(600) * MS),
             _ => Moment::Moving(chance.below(300) * MS),
         };
-        Script {
+        KillScript {
             seed,
             period_ns: [2 * MS, 4 * MS, 5 * MS][chance.below(3) as usize],
             watchdog_ns: (40 + chance.below(120)) * MS,
@@ -80,7 +80,7 @@ impl Script {
 }
 
 /// Body of the child process: runs the rig until it is killed.
-fn child(script: &Script, port: u16) {
+fn child(script: &KillScript, port: u16) {
     let (rig, model, _) = script.build();
     let world = Simulation::real_time();
     let clock = world.monotonic().expect("its time is real");
@@ -97,7 +97,7 @@ fn child(script: &Script, port: u16) {
 
 /// Outcome of a run.
 #[derive(Clone, Copy, Debug, PartialEq)]
-enum Shown {
+enum KillOutcome {
     /// The moment was not reached, because this computer was too busy.
     Nothing,
     /// No drive was enabled when the process was killed.
@@ -110,12 +110,12 @@ enum Shown {
 ///
 /// # Errors
 /// A violated property.
-fn run(script: &Script) -> Result<Shown, String> {
+fn run(script: &KillScript) -> Result<KillOutcome, String> {
     let (rig, _, plant) = script.build();
     let world = Simulation::real_time();
     let clock = world.monotonic().expect("its time is real");
     let bus = world.bus("can0", 1_000_000);
-    let mut bench = Bench::new(&rig, Some(plant), script.seed)?.in_steps_of(200_000);
+    let mut bench = SimulatedBench::new(&rig, Some(plant), script.seed)?.in_steps_of(200_000);
     for (node, has) in script.deadlines.into_iter().enumerate() {
         if !has {
             bench.drive(node).unwrap().without_deadlines();
@@ -149,7 +149,7 @@ fn run(script: &Script) -> Result<Shown, String> {
         });
         let Some(gone_ns) = killed_ns else {
             if process.try_wait().unwrap().is_some() || now_ns > START_NS {
-                break Ok(Shown::Nothing);
+                break Ok(KillOutcome::Nothing);
             }
             let begins = match script.moment {
                 Moment::Starting(_) => hub.members().len() > 1,
@@ -186,7 +186,11 @@ fn run(script: &Script) -> Result<Shown, String> {
             }
         }
         if now_ns > bound_ns + BRAKE_NS + 20 * MS {
-            break Ok(if enabled { Shown::Stopped(stopped_ns as f64 / timeout_ns as f64) } else { Shown::Idle });
+            break Ok(if enabled {
+                KillOutcome::Stopped(stopped_ns as f64 / timeout_ns as f64)
+            } else {
+                KillOutcome::Idle
+            });
         }
     };
     let _ = process.kill();
@@ -197,18 +201,18 @@ fn run(script: &Script) -> Result<Shown, String> {
 #[test]
 fn the_drives_of_a_killed_process_lose_their_torque_within_their_time_out() {
     if let Some(seed) = number("FRIC_KILLED") {
-        return child(&Script::of(seed), number("FRIC_PORT").expect("where its drives are") as u16);
+        return child(&KillScript::of(seed), number("FRIC_PORT").expect("where its drives are") as u16);
     }
     let seeds = seeds(RUNS);
     let all = (seeds.end - seeds.start) as usize;
-    let found = on_threads(seeds, THREADS, |seed| run(&Script::of(seed)));
-    let failed = failures(&found, Script::of);
+    let found = on_threads(seeds, THREADS, |seed| run(&KillScript::of(seed)));
+    let failed = failures(&found, KillScript::of);
     let (mut stopped, mut latest, mut nothing) = (0, 0.0f64, 0);
     for shown in found.iter().filter_map(|(_, shown)| shown.as_ref().ok()) {
         match shown {
-            Shown::Nothing => nothing += 1,
-            Shown::Idle => {}
-            Shown::Stopped(part) => (stopped, latest) = (stopped + 1, latest.max(*part)),
+            KillOutcome::Nothing => nothing += 1,
+            KillOutcome::Idle => {}
+            KillOutcome::Stopped(part) => (stopped, latest) = (stopped + 1, latest.max(*part)),
         }
     }
     println!(

@@ -14,7 +14,7 @@ use crate::can::sim::Simulation;
 use crate::can::{self, Bus};
 use crate::drive::polarity_check::SignTest;
 use crate::realtime::clock::Clock;
-use crate::realtime::threads::{self, RealTime, Refusal, Wishes};
+use crate::realtime::threads::{self, RealTime, RefusedWish, Wishes};
 use crate::record::log::{Sections, Settings, Sink, Summary};
 use abi::Instance;
 use abi::rig::Rig;
@@ -177,7 +177,7 @@ impl Session {
     }
 
     /// What the computer did not grant the thread.
-    pub fn refused(&self) -> &[Refusal] {
+    pub fn refused(&self) -> &[RefusedWish] {
         self.real_time.as_ref().map_or(&[], RealTime::refused)
     }
 

@@ -6,7 +6,7 @@
 
 use crate::can::sim::{Actor, Port, SimBus, Simulation};
 use crate::can::{Bus, Received};
-use crate::drive::simulated_plant::Bench;
+use crate::drive::simulated_plant::SimulatedBench;
 use crate::realtime::clock::Clock;
 use abi::Instance;
 use abi::rig::{Kind, Mode, Node, Rig};
@@ -30,7 +30,7 @@ pub struct World {
     simulation: Simulation,
     buses: Vec<SimBus>,
     masters: Vec<Box<dyn Bus>>,
-    bench: Rc<RefCell<Bench>>,
+    bench: Rc<RefCell<SimulatedBench>>,
 }
 
 /// The name of our own node on a simulated bus.
@@ -44,14 +44,14 @@ impl World {
     /// # Errors
     /// A message about a drive for which there is no simulation.
     pub fn new(rig: &Rig, plant: Option<Instance>, pace: Pace, seed: u64) -> Result<World, String> {
-        World::around(rig, Bench::new(rig, plant, seed)?, pace, seed)
+        World::around(rig, SimulatedBench::new(rig, plant, seed)?, pace, seed)
     }
 
-    /// The same with an existing [`Bench`].
+    /// The same with an existing [`SimulatedBench`].
     ///
     /// # Errors
     /// Does not fail at present.
-    pub fn around(rig: &Rig, bench: Bench, pace: Pace, seed: u64) -> Result<World, String> {
+    pub fn around(rig: &Rig, bench: SimulatedBench, pace: Pace, seed: u64) -> Result<World, String> {
         let simulation = match pace {
             Pace::Fast => Simulation::new(),
             Pace::Wall => Simulation::real_time(),
@@ -82,7 +82,7 @@ impl World {
     }
 
     /// Drives, devices and shaft.
-    pub fn bench(&self) -> RefMut<'_, Bench> {
+    pub fn bench(&self) -> RefMut<'_, SimulatedBench> {
         self.bench.borrow_mut()
     }
 
@@ -95,7 +95,7 @@ impl World {
 /// The simulated nodes with their ports.
 struct Nodes {
     ports: Vec<Port>,
-    bench: Rc<RefCell<Bench>>,
+    bench: Rc<RefCell<SimulatedBench>>,
 }
 
 impl Actor for Nodes {

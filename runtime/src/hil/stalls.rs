@@ -32,7 +32,7 @@ const WAKES_NS: u64 = 20 * MS;
 
 /// The point of a cycle at which it stalls.
 #[derive(Clone, Copy, PartialEq, Debug)]
-enum Place {
+enum StallPoint {
     /// After the sleep to its tick.
     Tick,
     /// After the wait for the answers.
@@ -43,7 +43,7 @@ enum Place {
 
 /// Parameters of one run.
 #[derive(Clone, Copy, PartialEq, Debug)]
-struct Script {
+struct StallScript {
     seed: u64,
     /// Period of the rig, ns.
     period_ns: u64,
@@ -51,24 +51,24 @@ struct Script {
     watchdog_ns: u64,
     /// The first cycle that may stall, the point in it, and the duration, ns of wall-clock time.
     cycle: u64,
-    place: Place,
+    place: StallPoint,
     stall_ns: u64,
 }
 
-impl Script {
-    fn of(seed: u64) -> Script {
+impl StallScript {
+    fn of(seed: u64) -> StallScript {
         let mut chance = Chance(seed);
         let watchdog_ns = (10 + chance.below(50)) * MS;
         let place = match chance.below(4) {
-            0 => Place::Tick,
-            1 => Place::Answers,
-            _ => Place::Sent(chance.below(4) as u32),
+            0 => StallPoint::Tick,
+            1 => StallPoint::Answers,
+            _ => StallPoint::Sent(chance.below(4) as u32),
         };
         let short = chance.below(4) == 0;
         let part = chance.between(0.1, 0.6);
         let stall_ns =
             if short { (watchdog_ns as f64 * part) as u64 } else { watchdog_ns + 50 * MS + chance.below(80) * MS };
-        Script {
+        StallScript {
             seed,
             period_ns: [MS, 2 * MS, 4 * MS][chance.below(3) as usize],
             watchdog_ns,
@@ -81,7 +81,7 @@ impl Script {
 
 /// State shared by the clock, the bus and the test.
 struct Plan {
-    script: Script,
+    script: StallScript,
     cycle: u64,
     sleeps: u32,
     sends: u32,
@@ -94,7 +94,7 @@ struct Plan {
 }
 
 impl Plan {
-    fn passes(&mut self, place: Place) {
+    fn passes(&mut self, place: StallPoint) {
         self.touched_ns = monotonic_ns();
         if self.cycle < self.script.cycle || place != self.script.place || self.stalled.is_some() {
             return;
@@ -123,7 +123,7 @@ impl Clock for StallingClock {
     fn sleep_until(&self, until_ns: u64) {
         self.0.sleep_until(until_ns);
         let mut plan = self.1.borrow_mut();
-        let place = if plan.sleeps == 0 { Place::Tick } else { Place::Answers };
+        let place = if plan.sleeps == 0 { StallPoint::Tick } else { StallPoint::Answers };
         plan.sleeps += 1;
         plan.passes(place);
     }
@@ -136,7 +136,7 @@ impl Bus for Slow {
     fn send(&mut self, frame: Frame) -> Result<(), Refused> {
         let sent = self.0.send(frame);
         let mut plan = self.1.borrow_mut();
-        let (cycle, place) = (plan.cycle, Place::Sent(plan.sends));
+        let (cycle, place) = (plan.cycle, StallPoint::Sent(plan.sends));
         plan.sent.push((monotonic_ns(), cycle, frame));
         plan.sends += 1;
         plan.passes(place);
@@ -164,7 +164,7 @@ struct Measured {
 
 /// Outcome of a run.
 #[derive(Clone, Copy, Debug, Default)]
-struct Shown {
+struct StallOutcome {
     /// Delay of the watchdog after its time-out, ns.
     late_ns: Option<u64>,
     /// The watchdog had to act; the cycle stalled while no drive was enabled; all cycles were in time.
@@ -177,7 +177,7 @@ struct Shown {
 ///
 /// # Errors
 /// A violated property.
-fn run(script: &Script) -> Result<Shown, String> {
+fn run(script: &StallScript) -> Result<StallOutcome, String> {
     let (mut rig, model, plant) = rigs::pair();
     rig.nodes.iter_mut().for_each(|node| node.timeout_ns = 3 * script.period_ns);
     (rig.period_ns, rig.watchdog_ns) = (script.period_ns, 5 * script.period_ns);
@@ -220,7 +220,7 @@ fn run(script: &Script) -> Result<Shown, String> {
     let plan = plan.borrow();
     let Some((at, begin_ns, over_ns, late_ns)) = plan.stalled else {
         // The run ended before the stall.
-        return if bites.is_empty() { Ok(Shown::default()) } else { judge_early(&bites, &cycles, script) };
+        return if bites.is_empty() { Ok(StallOutcome::default()) } else { judge_early(&bites, &cycles, script) };
     };
     let mut shown = judge_early(&bites, &cycles, script)?;
 
@@ -270,7 +270,7 @@ fn run(script: &Script) -> Result<Shown, String> {
 }
 
 /// Checks that the watchdog never acted early, and only while drives were enabled.
-fn judge_early(bites: &[u64], cycles: &[Measured], script: &Script) -> Result<Shown, String> {
+fn judge_early(bites: &[u64], cycles: &[Measured], script: &StallScript) -> Result<StallOutcome, String> {
     for bite in bites {
         let last = cycles.iter().rev().find(|cycle| cycle.end_ns <= *bite);
         let awake = last.is_some_and(|cycle| cycle.awake);
@@ -279,17 +279,17 @@ fn judge_early(bites: &[u64], cycles: &[Measured], script: &Script) -> Result<Sh
             return Err(format!("the watchdog acted at {bite} ns, due at {due_ns}, drives enabled: {awake}"));
         }
     }
-    Ok(Shown::default())
+    Ok(StallOutcome::default())
 }
 
 #[test]
 fn the_watchdog_stops_a_stalled_cycle_in_time_and_no_other() {
     let seeds = seeds(RUNS);
     let all = seeds.end - seeds.start;
-    let found = on_threads(seeds, THREADS, |seed| run(&Script::of(seed)));
-    let failed = failures(&found, Script::of);
-    let shown: Vec<Shown> = found.iter().filter_map(|(_, shown)| shown.clone().ok()).collect();
-    let count = |is: fn(&Shown) -> bool| shown.iter().filter(|shown| is(shown)).count();
+    let found = on_threads(seeds, THREADS, |seed| run(&StallScript::of(seed)));
+    let failed = failures(&found, StallScript::of);
+    let shown: Vec<StallOutcome> = found.iter().filter_map(|(_, shown)| shown.clone().ok()).collect();
+    let count = |is: fn(&StallOutcome) -> bool| shown.iter().filter(|shown| is(shown)).count();
     let kinds = [count(|shown| shown.had_to), count(|shown| shown.asleep), count(|shown| shown.in_time)];
     let mut late: Vec<u64> = shown.iter().filter_map(|shown| shown.late_ns).collect();
     late.sort_unstable();

@@ -56,7 +56,7 @@ enum Motion<'a> {
 
 /// State of the shaft at the end of a period, and the mean torque of the contact in it, which opposes a positive speed.
 #[derive(Clone, Copy)]
-struct Row {
+struct PeriodRow {
     x: f64,
     v: f64,
     torque: f64,
@@ -87,12 +87,15 @@ impl Stand<'_> {
         let angle = holds / stiffness;
         let both =
             |seconds: f64, motion: &Motion| Some([self.run(false, seconds, motion)?, self.run(true, seconds, motion)?]);
-        let pair = |runs: &[Vec<Row>; 2], of: &dyn Fn(&[Row]) -> f64| Pair { own: of(&runs[0]), played: of(&runs[1]) };
+        let pair = |runs: &[Vec<PeriodRow>; 2], of: &dyn Fn(&[PeriodRow]) -> f64| Pair {
+            own: of(&runs[0]),
+            played: of(&runs[1]),
+        };
 
         let ramp = |t: f64, _: f64| 1.3 * holds * t;
         let runs = both(1.2, &Motion::Pulled(&ramp))?;
         let period = self.rig.period_ns as f64 * 1e-9;
-        let first = |rows: &[Row]| {
+        let first = |rows: &[PeriodRow]| {
             let at = rows.iter().position(|row| row.x.abs() > 10.0 * angle);
             at.map_or(f64::INFINITY, |k| ramp(period * (k + 1) as f64, 0.0))
         };
@@ -108,7 +111,7 @@ impl Stand<'_> {
 
         let swing = |t: f64, _: f64| 0.8 * holds * (turn * t).sin();
         let runs = both(3.0, &Motion::Pulled(&swing))?;
-        let area = |rows: &[Row]| {
+        let area = |rows: &[PeriodRow]| {
             let last = &rows[rows.len() * 2 / 3..];
             last.windows(2).map(|pair| pair[1].torque * (pair[1].x - pair[0].x)).sum::<f64>()
         };
@@ -126,8 +129,9 @@ impl Stand<'_> {
             }
             count
         });
-        let apart =
-            |rows: &[Vec<Row>; 2]| rows[0].iter().zip(&rows[1]).map(|(a, b)| a.torque - b.torque).collect::<Vec<_>>();
+        let apart = |rows: &[Vec<PeriodRow>; 2]| {
+            rows[0].iter().zip(&rows[1]).map(|(a, b)| a.torque - b.torque).collect::<Vec<_>>()
+        };
         let squares: f64 = apart(&runs).iter().map(|d| d * d).sum();
         let stick_slip_error = (squares / runs[0].len() as f64).sqrt() / holds;
 
@@ -147,7 +151,7 @@ impl Stand<'_> {
 
     /// One experiment from rest, one row per period. `played`: by the drive instead of the ideal contact. None if the
     /// program fails.
-    fn run(&self, played: bool, seconds: f64, motion: &Motion) -> Option<Vec<Row>> {
+    fn run(&self, played: bool, seconds: f64, motion: &Motion) -> Option<Vec<PeriodRow>> {
         let Stand { rig, plant, inertia, .. } = self;
         let output = &rig.outputs[self.contact.output];
         let node = &rig.nodes[output.signal.node];
@@ -220,7 +224,7 @@ impl Stand<'_> {
                 }
                 sum -= torque / FINE as f64;
             }
-            rows.push(Row { x, v, torque: sum });
+            rows.push(PeriodRow { x, v, torque: sum });
         }
         rows.iter().all(|row| row.v.is_finite()).then_some(rows)
     }

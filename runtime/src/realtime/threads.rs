@@ -51,7 +51,7 @@ pub enum What {
 
 /// A wish that was refused.
 #[derive(Clone, PartialEq, Eq, Debug)]
-pub struct Refusal {
+pub struct RefusedWish {
     /// The wish.
     pub what: What,
     /// The kernel's message.
@@ -60,7 +60,7 @@ pub struct Refusal {
     pub remedy: &'static str,
 }
 
-impl fmt::Display for Refusal {
+impl fmt::Display for RefusedWish {
     fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
         write!(f, "{:?}: {}; {}", self.what, self.reason, self.remedy)
     }
@@ -69,7 +69,7 @@ impl fmt::Display for Refusal {
 /// A thread that has been set up. Dropping it restores priority, core and processor sleep; memory stays locked.
 #[derive(Debug)]
 pub struct RealTime {
-    refused: Vec<Refusal>,
+    refused: Vec<RefusedWish>,
     priority_set: bool,
     cores_before: Option<libc::cpu_set_t>,
     // The kernel honours the request while the file is open.
@@ -86,7 +86,7 @@ pub fn enter(wishes: &Wishes) -> RealTime {
     let mut ask = |what: What, result: io::Result<()>, remedy| match result {
         Ok(()) => true,
         Err(error) => {
-            refused.push(Refusal { what, reason: error.to_string(), remedy });
+            refused.push(RefusedWish { what, reason: error.to_string(), remedy });
             false
         }
     };
@@ -138,7 +138,7 @@ pub fn stand_by(priority: i32) {
 
 impl RealTime {
     /// The refused wishes; a real drive requires that there are none.
-    pub fn refused(&self) -> &[Refusal] {
+    pub fn refused(&self) -> &[RefusedWish] {
         &self.refused
     }
 }

@@ -20,7 +20,7 @@ fn echo(t: f64, time: f64) -> f64 {
 }
 
 /// The history of one delay.
-struct Line {
+struct DelayHistory {
     delay: Delay,
     /// T in s.
     time: f64,
@@ -30,13 +30,13 @@ struct Line {
 
 /// The history of every delay of a model.
 pub(crate) struct History {
-    lines: Vec<Line>,
+    lines: Vec<DelayHistory>,
 }
 
 impl History {
     /// The history of an instance at its start, with its outputs computed.
     pub(crate) fn new(instance: &Instance) -> History {
-        let line = |delay: &Delay| Line {
+        let line = |delay: &Delay| DelayHistory {
             time: instance.get(delay.time),
             samples: VecDeque::from([(0.0, instance.get(delay.source))]),
             delay: delay.clone(),
@@ -59,7 +59,7 @@ impl History {
 
     /// The longest step that needs no value that is still unknown.
     pub(crate) fn longest(&self) -> f64 {
-        let least = |line: &Line| if line.delay.weight.is_none() { line.time } else { f64::INFINITY };
+        let least = |line: &DelayHistory| if line.delay.weight.is_none() { line.time } else { f64::INFINITY };
         self.lines.iter().map(least).fold(f64::INFINITY, f64::min)
     }
 
@@ -71,7 +71,7 @@ impl History {
     /// The number of linear pieces from the newest sample to the values in the block so that the interpolation error is
     /// at most the fraction `tol` of their size; `middle`: the values halfway.
     pub(crate) fn pieces(&self, middle: &[f64], instance: &Instance, tol: f64) -> u32 {
-        let needed = |(line, middle): (&Line, &f64)| {
+        let needed = |(line, middle): (&DelayHistory, &f64)| {
             let (start, end) = (line.samples.back().expect("the start is a sample").1, instance.get(line.delay.source));
             let size = start.abs().max(middle.abs()).max(end.abs());
             let bend = (start - 2.0 * middle + end).abs();

@@ -1,7 +1,7 @@
 //! A rig for tests: two servos on one shaft, and a switch with a lamp; with both sides of its bus in one process.
 
 use crate::can::Frame;
-use crate::drive::{Bench, Fieldbus, Options, Step};
+use crate::drive::{Fieldbus, Options, SimulatedBench, Step};
 use crate::testing::models::Model;
 use crate::testing::nodes;
 use abi::rig::{DriveLimits, Field, Format, Kind, Message, Mode, Node, Plant, Rig, Signal, SignalKind};
@@ -109,7 +109,7 @@ pub fn shaft(inertia: f64, viscous: f64) -> Instance {
 /// Both sides of a bus connected directly: each frame arrives at once.
 pub struct Table {
     pub fieldbus: Fieldbus,
-    pub bench: Bench,
+    pub bench: SimulatedBench,
     pub now_ns: u64,
     pub period_ns: u64,
     /// Commands of the model while armed.
@@ -120,11 +120,11 @@ pub struct Table {
 
 impl Table {
     pub fn new(rig: &Rig, plant: Option<Instance>, options: Options) -> Table {
-        let bench = Bench::new(rig, plant, 7).expect("a bench");
+        let bench = SimulatedBench::new(rig, plant, 7).expect("a bench");
         Table::with(rig, bench, options)
     }
 
-    pub fn with(rig: &Rig, bench: Bench, options: Options) -> Table {
+    pub fn with(rig: &Rig, bench: SimulatedBench, options: Options) -> Table {
         Table {
             fieldbus: Fieldbus::new(rig, options).expect("a right rig"),
             bench,

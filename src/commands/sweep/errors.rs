@@ -4,7 +4,7 @@
 //! verdicts of the sample are undecided. The sample depends only on the size of the table; each of its runs is repeated
 //! with its companions, so the table itself is not changed.
 
-use super::{Table, extremes};
+use super::{SweepTable, extremes};
 use crate::compile::PreparedRun;
 use crate::quantity::{count, significant};
 use crate::results;
@@ -49,7 +49,7 @@ pub(super) struct Errors {
     open: Vec<(String, u64)>,
 }
 
-impl Table {
+impl SweepTable {
     /// Estimates the errors of the sampled runs in `range`; none if the experiment has no measures or if `stopped` was
     /// set before the end. The result does not depend on the number of threads.
     pub(super) fn errors(

@@ -6,7 +6,7 @@
 //! over a parameter. The file is read once, in bounded memory.
 
 use super::best::{Best, Statistic};
-use super::{Column, ColumnKind, Table};
+use super::{Column, ColumnKind, SweepTable};
 use crate::args::Sweep;
 use crate::plot::{Curve, Figure, Panel};
 use crate::quantity::{count, significant};
@@ -24,7 +24,7 @@ const MOST_LINES: usize = 40;
 /// Most values that are kept for statistics of the points of a grid.
 const MOST_KEPT: u64 = 4_000_000;
 
-impl Table {
+impl SweepTable {
     /// Reads the file once.
     pub(super) fn summary(&self, path: &Path, header: bool) -> io::Result<Summary> {
         let mut reader = csv::ReaderBuilder::new().has_headers(header).from_path(path).map_err(io::Error::other)?;
@@ -240,7 +240,7 @@ impl Summary {
         }
     }
 
-    pub(super) fn words(&self, table: &Table) -> String {
+    pub(super) fn words(&self, table: &SweepTable) -> String {
         let mut out = match (&table.best, self.draws > 0) {
             (Some((best, column)), true) => self.best_points(table, best, *column),
             (Some((best, _)), false) => {
@@ -286,7 +286,7 @@ impl Summary {
     }
 
     /// The cell of a column that tells rows apart.
-    fn told(&self, table: &Table, row: &[f64], column: usize) -> String {
+    fn told(&self, table: &SweepTable, row: &[f64], column: usize) -> String {
         match self.tallies[column].kind {
             ColumnKind::Case => table.cases[table.case_of(row[0] as u64)].label.clone(),
             _ => significant(row[column], 5),
@@ -294,7 +294,7 @@ impl Summary {
     }
 
     /// Rows as lines: their run, what varies, the measures, and whether the expectations hold.
-    fn lines(&self, table: &Table, rows: &[&Vec<f64>]) -> Vec<Vec<String>> {
+    fn lines(&self, table: &SweepTable, rows: &[&Vec<f64>]) -> Vec<Vec<String>> {
         let (told, measured) = self.told_and_measured();
         let verdicts: Vec<usize> =
             (0..self.tallies.len()).filter(|k| self.tallies[*k].kind == ColumnKind::Verdict).collect();
@@ -321,7 +321,7 @@ impl Summary {
     }
 
     /// Where each measure is least and greatest.
-    fn extremes(&self, table: &Table) -> String {
+    fn extremes(&self, table: &SweepTable) -> String {
         let (told, measured) = self.told_and_measured();
         let at = |row: &[f64]| {
             let one = |k: &usize| match self.tallies[*k].kind {
@@ -346,7 +346,7 @@ impl Summary {
     }
 
     /// For each point of a grid the mean, the deviation and two quantiles of each measure.
-    fn of_points(&self, table: &Table) -> String {
+    fn of_points(&self, table: &SweepTable) -> String {
         let (told, measured) = self.grid_columns(table);
         let mut head: Vec<String> = told.iter().map(|k| self.tallies[*k].title.clone()).collect();
         for k in &measured {
@@ -369,7 +369,7 @@ impl Summary {
     }
 
     /// The best points of a grid with distributions.
-    fn best_points(&self, table: &Table, best: &Best, column: usize) -> String {
+    fn best_points(&self, table: &SweepTable, best: &Best, column: usize) -> String {
         let (told, _) = self.grid_columns(table);
         let statistic =
             |rows: &Vec<Vec<f64>>| best.statistic.of(&rows.iter().map(|row| row[column]).collect::<Vec<_>>());
@@ -386,7 +386,7 @@ impl Summary {
     }
 
     /// The columns that tell the points of a grid apart, without distributions; and those of measures.
-    fn grid_columns(&self, table: &Table) -> (Vec<usize>, Vec<usize>) {
+    fn grid_columns(&self, table: &SweepTable) -> (Vec<usize>, Vec<usize>) {
         let (mut told, measured) = self.told_and_measured();
         told.retain(|k| match self.tallies[*k].kind {
             ColumnKind::Varied => {

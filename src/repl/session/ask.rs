@@ -3,7 +3,7 @@
 //! In: expressions, names, paths. Out: values, trees, explanations. Changes nothing.
 
 use super::words::{Value, literal, model_of};
-use super::{Fault, Session, Setup, TEXT, Used, What, begin, found};
+use super::{Fault, Session, Setup, Subject, TEXT, Used, begin, found};
 use crate::compile::{self, Case, Changes, Explanation, Loaded, Lookup, QuantityInfo, SourceFile, Space};
 use abi::unit::{Dimension, Unit};
 use grammar::ast::{self, Item};
@@ -16,7 +16,7 @@ impl Session {
     /// The present value of an expression.
     pub fn value(&mut self, text: &str) -> Result<Value, Fault> {
         let text = self.with_values(text)?;
-        let what = self.meant(&text).unwrap_or(What::Session);
+        let what = self.meant(&text).unwrap_or(Subject::Session);
         let case = match self.now(&what, &[format!("plot {text}")], &text) {
             Err(Fault::Found(files, errors)) if errors.iter().any(|error| error.code == "E0901") => {
                 return self.measured(&what, &text).unwrap_or(Err(Fault::Found(files, unplotted(errors))));
@@ -31,7 +31,7 @@ impl Session {
     }
 
     /// The first case of `what`, in its present state.
-    pub(super) fn now(&self, what: &What, also: &[String], typed: &str) -> Result<Case, Fault> {
+    pub(super) fn now(&self, what: &Subject, also: &[String], typed: &str) -> Result<Case, Fault> {
         let (mut loaded, name) = self.loaded(what, "");
         // A query needs no expectations, and no long run.
         let setup = Setup { also: Vec::new(), duration: Some(1.0), ..self.setup(what).clone() };
@@ -44,8 +44,8 @@ impl Session {
     }
 
     /// A measure over the last run, such as `max(fr.F)`.
-    pub(super) fn measured(&mut self, what: &What, text: &str) -> Option<Result<Value, Fault>> {
-        self.setup(what).duration.or_else(|| matches!(what, What::Experiment(..)).then_some(1.0))?;
+    pub(super) fn measured(&mut self, what: &Subject, text: &str) -> Option<Result<Value, Fault>> {
+        self.setup(what).duration.or_else(|| matches!(what, Subject::Experiment(..)).then_some(1.0))?;
         let setup = Setup { also: vec![format!("show {text}")], ..self.setup(what).clone() };
         let (mut loaded, name) = self.loaded(what, "");
         let cases = self.compiled_in(&mut loaded, &name, &setup, &[], false);
@@ -143,7 +143,7 @@ impl Session {
 
     /// The dimension that fits in place of `?` in a line.
     pub fn wanted(&self, line: &str) -> Option<Dimension> {
-        let what = self.meant(line).unwrap_or(What::Session);
+        let what = self.meant(line).unwrap_or(Subject::Session);
         let (mut loaded, name) = self.loaded(&what, "");
         let setup = Setup { also: Vec::new(), duration: Some(1.0), ..self.setup(&what).clone() };
         let errors = self.compiled_in(&mut loaded, &name, &setup, &[format!("plot {line}")], true).err()?;
@@ -158,7 +158,7 @@ impl Session {
     }
 
     /// Every quantity of `what`; empty if it does not compile in its present form.
-    pub(super) fn listed(&self, what: &What, setup: &Setup) -> Arc<[QuantityInfo]> {
+    pub(super) fn listed(&self, what: &Subject, setup: &Setup) -> Arc<[QuantityInfo]> {
         let (mut loaded, name) = self.loaded(what, "");
         let changes = Changes { set: setup.set.clone(), unjudged: true, ..Changes::default() };
         compile::quantities(&mut loaded, &crate::disk::Disk, &name, &changes).unwrap_or_default().into()
@@ -211,12 +211,12 @@ impl Session {
         Err(Fault::Words(format!("there is no quantity, part, model or experiment `{name}` here; {help}")))
     }
 
-    fn explained_run(&self, what: &What, typed: &str) -> Result<Explanation, Fault> {
+    fn explained_run(&self, what: &Subject, typed: &str) -> Result<Explanation, Fault> {
         let (mut loaded, experiment) = self.loaded(what, "");
         // Settings belong to the last run, or to the instances.
         let set = match &self.stage {
             Some((staged, setup)) if staged == what => setup.set.clone(),
-            _ if *what == What::Session => self.bench.set.clone(),
+            _ if *what == Subject::Session => self.bench.set.clone(),
             _ => Vec::new(),
         };
         let changes = Changes { set, unjudged: true, ..Changes::default() };
@@ -264,14 +264,14 @@ impl Session {
     }
 
     /// The place of an experiment with this name: among the session's own, or in the file in use, last first.
-    pub(super) fn experiment(&self, name: &str) -> Result<What, Fault> {
+    pub(super) fn experiment(&self, name: &str) -> Result<Subject, Fault> {
         let own = compile::load(TEXT, &self.items.join("\n"), &crate::disk::Disk);
         if own.experiments().iter().any(|experiment| experiment.name == name) {
-            return Ok(What::Experiment(None, name.into()));
+            return Ok(Subject::Experiment(None, name.into()));
         }
         let has = |used: &Used| used.loaded.experiments().iter().any(|experiment| experiment.name == name);
         if let Some(file) = self.used.iter().rposition(has) {
-            return Ok(What::Experiment(Some(file), name.into()));
+            return Ok(Subject::Experiment(Some(file), name.into()));
         }
         let experiments = self.experiments();
         let known = experiments.iter().map(String::as_str).chain(self.parts.iter().map(|part| part.name.as_str()));
@@ -287,9 +287,9 @@ impl Session {
     pub fn staged(&self) -> Option<(String, Vec<String>)> {
         let (what, setup) = self.stage.as_ref()?;
         let name = match what {
-            What::Experiment(_, name) => name.clone(),
-            What::Typed(instance) => instance.clone(),
-            What::Session => return None,
+            Subject::Experiment(_, name) => name.clone(),
+            Subject::Typed(instance) => instance.clone(),
+            Subject::Session => return None,
         };
         let read = setup.known.iter().filter(|q| q.kind != "param");
         Some((name, read.map(|q| q.path.clone()).collect()))

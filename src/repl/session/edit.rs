@@ -3,7 +3,7 @@
 //! In: lines as typed. Out: the changed session, or the old one if a line has errors. Changes are described in words.
 
 use super::words::{counted, with_inputs};
-use super::{EXPERIMENT, Fault, MODEL, Part, Session, TEXT, Used, What, found, run};
+use super::{EXPERIMENT, Fault, MODEL, PromptPart, Session, Subject, TEXT, Used, found, run};
 use crate::compile::{self, Loaded, Lookup, Space};
 use crate::project;
 use grammar::ast::{self, DeclarationKind, Item, Statement};
@@ -138,7 +138,7 @@ impl Session {
         next.bench.set.retain(|set| !set.starts_with(&prefix));
         next.bench.also.retain(|_| false);
         next.parts.retain(|part| part.name != name);
-        next.parts.push(Part { name: name.into(), instance: instance.clone(), open: open.clone() });
+        next.parts.push(PromptPart { name: name.into(), instance: instance.clone(), open: open.clone() });
         let (text, _, at) = next.text("", &run(MODEL, 1.0));
         let typed = with_inputs(&instance, open.iter().map(|name| (name.as_str(), "0")));
         let mut loaded = compile::load(TEXT, &text, &crate::disk::Disk);
@@ -154,7 +154,7 @@ impl Session {
         })?;
         drop(case);
         next.at_bench = true;
-        next.bench.known = next.listed(&What::Session, &next.bench);
+        next.bench.known = next.listed(&Subject::Session, &next.bench);
         *self = next;
         let known = self.bench.known.clone();
         let count = |kind: &str| known.iter().filter(|q| q.kind == kind && q.path.starts_with(&prefix)).count();
@@ -197,7 +197,7 @@ impl Session {
         let (mut loaded, name) = self.loaded(&what, "");
         let cases = self.compiled_in(&mut loaded, &name, &setup, &[], true);
         cases.map_err(|errors| found(&loaded, &errors, setting, None))?;
-        self.at_bench = what == What::Session;
+        self.at_bench = what == Subject::Session;
         *self.setup_mut(&what) = setup;
         if grammar::parse::parse_setting(FileId(0), setting).0.is_none() {
             // Another model in a slot has other quantities.

@@ -4,7 +4,7 @@
 //! continues from the end of the last run.
 
 use super::words::{Value, rewired, unit_as_typed};
-use super::{Fault, Session, Setup, What, begin, found};
+use super::{Fault, Session, Setup, Subject, begin, found};
 use crate::compile::{self, Case, Changes, Options, QuantityInfo, Varying};
 use crate::quantity;
 use abi::plan::{Method, Series};
@@ -68,22 +68,22 @@ impl Session {
     ) -> Result<Ran, Fault> {
         let what = match name {
             "" => self.current(),
-            name if self.parts.iter().any(|part| part.name == name) => What::Session,
-            name if name.contains('(') => What::Typed(name.to_string()),
+            name if self.parts.iter().any(|part| part.name == name) => Subject::Session,
+            name if name.contains('(') => Subject::Typed(name.to_string()),
             name => self.experiment(name)?,
         };
         let kept = match &self.stage {
             Some((staged, setup)) if *staged == what => setup.clone(),
             _ => Setup::default(),
         };
-        let mut setup = if what == What::Session { self.bench.clone() } else { kept };
+        let mut setup = if what == Subject::Session { self.bench.clone() } else { kept };
         setup.duration = duration.or(setup.duration);
         setup.live = None;
-        if setup.duration.is_none() && !matches!(what, What::Experiment(..)) {
+        if setup.duration.is_none() && !matches!(what, Subject::Experiment(..)) {
             let name = if name.is_empty() { "f" } else { name };
             return Err(Fault::Words(format!("for how long? `run {name} for 2 s`")));
         }
-        self.at_bench = what == What::Session;
+        self.at_bench = what == Subject::Session;
         if setup.known.is_empty() {
             setup.known = self.listed(&what, &setup);
         }
@@ -91,13 +91,13 @@ impl Session {
         let outputs: Vec<&str> =
             setup.known.iter().filter(|q| q.kind == "output").map(|q| q.path.as_str()).take(MOST_DRAWN).collect();
         let shows = match &what {
-            What::Experiment(..) => Vec::new(),
+            Subject::Experiment(..) => Vec::new(),
             _ if outputs.is_empty() => Vec::new(),
             _ => vec![format!("plot {}", outputs.join(", "))],
         };
         let ran = self.ran(&what, &setup, &shows, name, None, watch)?;
         match what {
-            What::Session => self.bench = setup,
+            Subject::Session => self.bench = setup,
             what => self.stage = Some((what, setup)),
         }
         let what = self.current();
@@ -116,7 +116,7 @@ impl Session {
         let statement = self.with_values(statement)?;
         let what = self.meant(&statement).unwrap_or_else(|| self.current());
         let setup = self.setup(&what).clone();
-        if setup.duration.is_none() && !matches!(what, What::Experiment(..)) {
+        if setup.duration.is_none() && !matches!(what, Subject::Experiment(..)) {
             return Err("nothing has been run yet: `run NAME for 10 s` first".into());
         }
         let (ran, _) = self.ran(&what, &setup, std::slice::from_ref(&statement), "", None, watch)?;
@@ -147,7 +147,7 @@ impl Session {
 
     pub(super) fn ran(
         &self,
-        what: &What,
+        what: &Subject,
         setup: &Setup,
         also: &[String],
         name: &str,
@@ -158,7 +158,7 @@ impl Session {
         let typed = also.first().map_or(name, String::as_str);
         let (cases, warnings) =
             self.compiled_in(&mut loaded, &experiment, setup, also, false).map_err(|errors| match what {
-                What::Typed(instance) if !name.is_empty() => {
+                Subject::Typed(instance) if !name.is_empty() => {
                     let at = loaded.files.get(loaded.root()).text.find(&format!("  run {instance}")).map(|at| at + 6);
                     found(&loaded, &errors, instance, at)
                 }
@@ -186,9 +186,9 @@ impl Session {
         };
         let warnings = (!warnings.is_empty()).then(|| found(&loaded, &warnings, typed, None));
         let name = match what {
-            What::Session => self.parts.iter().map(|part| part.name.as_str()).collect::<Vec<_>>().join(", "),
-            What::Experiment(_, name) => name.clone(),
-            What::Typed(instance) => instance.clone(),
+            Subject::Session => self.parts.iter().map(|part| part.name.as_str()).collect::<Vec<_>>().join(", "),
+            Subject::Experiment(_, name) => name.clone(),
+            Subject::Typed(instance) => instance.clone(),
         };
         Ok((Ran { name, cases, results, warnings, carried }, live))
     }
@@ -196,7 +196,7 @@ impl Session {
     /// One fixed step of `h` seconds; returns the time and every quantity.
     pub fn step(&mut self, h: f64) -> Result<(f64, Vec<Shown>), Fault> {
         let what = self.current();
-        if what == What::Session && self.parts.is_empty() {
+        if what == Subject::Session && self.parts.is_empty() {
             return Err("there is nothing to step: `f = LuGre()` makes an instance".into());
         }
         let (mut loaded, name) = self.loaded(&what, "");
@@ -288,13 +288,13 @@ impl Session {
                 let (loaded, name) = self.loaded(&what, "");
                 (loaded, name, path.to_string(), setup)
             }
-            ("input", Some((part, input))) if what == What::Session && !input.contains('.') => {
+            ("input", Some((part, input))) if what == Subject::Session && !input.contains('.') => {
                 // The input is connected to a parameter of the session itself.
                 let mut wired = self.clone();
                 let part = wired.parts.iter_mut().find(|one| one.name == part).expect("it has this quantity");
                 part.instance = rewired(&part.instance, input, SWEPT);
                 part.open.retain(|open| open != input);
-                let (loaded, name) = wired.loaded(&What::Session, &format!("  param {SWEPT} = {from}\n"));
+                let (loaded, name) = wired.loaded(&Subject::Session, &format!("  param {SWEPT} = {from}\n"));
                 let same = |set: &String| set.split('=').next().unwrap_or_default().trim() == path;
                 let set = setup.set.iter().filter(|set| !same(set)).cloned().collect();
                 (loaded, name, SWEPT.to_string(), Setup { set, ..setup })

@@ -56,7 +56,7 @@ impl From<&str> for Fault {
 
 /// The subject of runs, steps and changes.
 #[derive(Clone, PartialEq, Debug)]
-enum What {
+enum Subject {
     /// The instances of the session.
     Session,
     /// An experiment: the file in use that contains it, or none for the session's own items.
@@ -82,7 +82,7 @@ struct Setup {
 
 /// `f = LuGre(vd = 10 mm/s)`
 #[derive(Clone)]
-struct Part {
+struct PromptPart {
     name: String,
     /// As typed.
     instance: String,
@@ -102,12 +102,12 @@ struct Used {
 pub struct Session {
     /// Imports and items, as typed.
     items: Vec<String>,
-    parts: Vec<Part>,
+    parts: Vec<PromptPart>,
     used: Vec<Used>,
     /// The instances.
     bench: Setup,
     /// The last run other than of the instances, and its changes.
-    stage: Option<(What, Setup)>,
+    stage: Option<(Subject, Setup)>,
     /// Whether the previous line was about the instances.
     at_bench: bool,
     ans: Option<Value>,
@@ -173,7 +173,7 @@ impl Session {
     }
 
     /// The subject of a line: the instances if it names one, else the last run.
-    fn meant(&self, text: &str) -> Option<What> {
+    fn meant(&self, text: &str) -> Option<Subject> {
         let mut after_dot = false;
         let mut words = false;
         for token in tokens(text).into_iter().filter(|token| !token.is_trivia()) {
@@ -181,7 +181,7 @@ impl Session {
             if token.kind == TokenKind::Word && !after_dot {
                 words = true;
                 if self.parts.iter().any(|part| part.name == word) || self.own_constant(word) {
-                    return Some(What::Session);
+                    return Some(Subject::Session);
                 }
             }
             after_dot = word == ".";
@@ -201,21 +201,21 @@ impl Session {
     }
 
     /// The subject of a command without names.
-    fn current(&self) -> What {
+    fn current(&self) -> Subject {
         match &self.stage {
             Some((what, _)) if !self.at_bench => what.clone(),
-            _ => What::Session,
+            _ => Subject::Session,
         }
     }
 
-    fn setup(&self, what: &What) -> &Setup {
+    fn setup(&self, what: &Subject) -> &Setup {
         match &self.stage {
             Some((staged, setup)) if staged == what => setup,
             _ => &self.bench,
         }
     }
 
-    fn setup_mut(&mut self, what: &What) -> &mut Setup {
+    fn setup_mut(&mut self, what: &Subject) -> &mut Setup {
         match &mut self.stage {
             Some((staged, setup)) if staged == what => setup,
             _ => &mut self.bench,
@@ -223,17 +223,17 @@ impl Session {
     }
 
     /// The text that contains the subject, and the name of its experiment.
-    fn loaded(&self, what: &What, more: &str) -> (Loaded, String) {
+    fn loaded(&self, what: &Subject, more: &str) -> (Loaded, String) {
         match what {
-            What::Experiment(Some(file), name) => (self.used[*file].loaded.clone(), name.clone()),
-            What::Experiment(None, name) => {
+            Subject::Experiment(Some(file), name) => (self.used[*file].loaded.clone(), name.clone()),
+            Subject::Experiment(None, name) => {
                 (compile::load(TEXT, &self.text(more, "").0, &crate::disk::Disk), name.clone())
             }
-            What::Session => {
+            Subject::Session => {
                 let text = self.text(more, &run(MODEL, 1.0)).0;
                 (compile::load(TEXT, &text, &crate::disk::Disk), EXPERIMENT.into())
             }
-            What::Typed(instance) => {
+            Subject::Typed(instance) => {
                 let text = self.text(more, &format!("experiment {EXPERIMENT} {{\n  run {instance} for 1 s\n}}")).0;
                 (compile::load(TEXT, &text, &crate::disk::Disk), EXPERIMENT.into())
             }

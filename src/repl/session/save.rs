@@ -2,7 +2,7 @@
 //!
 //! In: a session. Out: the text of an experiment, checked and formatted.
 
-use super::{Fault, MODEL, Session, What, found};
+use super::{Fault, MODEL, Session, Subject, found};
 use crate::compile::{self, Loaded};
 use grammar::ast::{self, Item};
 use grammar::diagnostic::Diagnostic;
@@ -16,18 +16,18 @@ impl Session {
         let mut text = String::new();
         let mut lines = Vec::new();
         match &what {
-            What::Session => {
+            Subject::Session => {
                 if self.parts.is_empty() {
                     return Err("there is nothing to save yet: make an instance, or run an experiment".into());
                 }
                 text += &self.text("", "").0;
                 lines.push(format!("run {MODEL}() for {}", seconds(setup.duration.unwrap_or(1.0))));
             }
-            What::Typed(instance) => {
+            Subject::Typed(instance) => {
                 text += &(self.items.join("\n") + "\n");
                 lines.push(format!("run {instance} for {}", seconds(setup.duration.unwrap_or(1.0))));
             }
-            What::Experiment(file, experiment) => {
+            Subject::Experiment(file, experiment) => {
                 match file {
                     Some(file) => text += &imports(&self.used[*file], folder),
                     None => text += &(self.items.join("\n") + "\n"),

@@ -16,9 +16,9 @@ use abi::Slot;
 
 /// Index of a node.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Debug)]
-pub struct Node(pub u32);
+pub struct NodeId(pub u32);
 
-impl Node {
+impl NodeId {
     pub fn index(self) -> usize {
         self.0 as usize
     }
@@ -100,45 +100,45 @@ pub enum MachineOp {
     /// A constant in every lane, by its bits.
     Constant(u64),
     /// An instruction with two operands, and whether these commute.
-    Binary(Instruction, bool, Node, Node),
+    Binary(Instruction, bool, NodeId, NodeId),
     /// An instruction with one operand and perhaps an immediate.
-    Unary(Instruction, Option<u8>, Node),
+    Unary(Instruction, Option<u8>, NodeId),
     /// ±a · b ± c
     Fma {
         signs: Signs,
-        a: Node,
-        b: Node,
-        c: Node,
+        a: NodeId,
+        b: NodeId,
+        c: NodeId,
     },
     /// Shift by a constant.
-    Shift(Direction, Node, u8),
+    Shift(Direction, NodeId, u8),
     /// Comparison of reals; quiet: without an exception for NaN.
-    Compare(Predicate, Node, Node),
+    Compare(Predicate, NodeId, NodeId),
     /// Comparison of integers: equal (0) or less (1).
-    CompareInt(u8, Node, Node),
+    CompareInt(u8, NodeId, NodeId),
     /// A mask: whether two integers have a set bit in common. AVX-512 only.
-    TestBits(Node, Node),
+    TestBits(NodeId, NodeId),
     /// A constant mask, the same in every lane.
     Mask(bool),
-    MaskAnd(Node, Node),
-    MaskOr(Node, Node),
-    MaskNot(Node),
+    MaskAnd(NodeId, NodeId),
+    MaskOr(NodeId, NodeId),
+    MaskNot(NodeId),
     /// The second operand in lanes where the first is true, else the third.
-    Select(Node, Node, Node),
+    Select(NodeId, NodeId, NodeId),
     /// As `Select`, of masks.
-    MaskSelect(Node, Node, Node),
+    MaskSelect(NodeId, NodeId, NodeId),
     /// b · 2^⌊c⌋ in lanes where the mask a is set, else 0, for operands a, b, c. AVX-512 only.
-    Scale(Node, Node, Node),
+    Scale(NodeId, NodeId, NodeId),
     /// Entries of the table at `base` of the pool; indices are in range.
     Gather {
         base: u32,
         len: u32,
-        index: Node,
+        index: NodeId,
     },
     /// Eight entries of a table: the first half of a quarter, or the second. The same in every vector. AVX-512 only.
     TableRow(TableQuarter, bool),
     /// Entries of a table of sixteen, which two rows hold, by the low four bits of an integer. AVX-512 only.
-    Permute(Node, Node, Node),
+    Permute(NodeId, NodeId, NodeId),
 }
 
 /// A quarter of a table of 64 entries for e^x: the entries from i = 16 · number.
@@ -175,7 +175,7 @@ pub enum Direction {
 
 impl MachineOp {
     /// Operands from left to right.
-    pub fn operands(self) -> impl Iterator<Item = Node> {
+    pub fn operands(self) -> impl Iterator<Item = NodeId> {
         let all = match self {
             MachineOp::Load(_) | MachineOp::Constant(_) | MachineOp::TableRow(..) | MachineOp::Mask(_) => [None; 3],
             MachineOp::Unary(_, _, a)
@@ -236,18 +236,18 @@ impl MachineOp {
 pub struct Nodes {
     pub nodes: Vec<MachineOp>,
     /// Stores to slots of the block.
-    pub stores: Vec<(Slot, Node)>,
+    pub stores: Vec<(Slot, NodeId)>,
     /// The status, an integer per lane.
-    pub status: Option<Node>,
+    pub status: Option<NodeId>,
     /// A mask; in lanes where it is not set the status is 0.
-    pub failed: Option<Node>,
+    pub failed: Option<NodeId>,
     /// Whether the pool begins with the tables of the elementary functions.
     pub pooled: bool,
 }
 
 impl Nodes {
     /// The nodes that are stored, and the status.
-    pub fn results(&self) -> impl Iterator<Item = Node> {
+    pub fn results(&self) -> impl Iterator<Item = NodeId> {
         self.stores.iter().map(|(_, node)| *node).chain(self.status)
     }
 }
@@ -286,7 +286,7 @@ pub fn select(func: &Func, width: Vectors, pooled: bool) -> Result<Nodes, Unsupp
 struct Selection {
     width: Vectors,
     nodes: Vec<MachineOp>,
-    known: HashMap<MachineOp, Node>,
+    known: HashMap<MachineOp, NodeId>,
 }
 
 /// Response table of VFIXUPIMMPD for the sign of a real, four bits per kind of source: 2 is a quiet NaN, 1 the source
@@ -299,31 +299,31 @@ impl Selection {
         Selection { width, nodes: Vec::new(), known: HashMap::default() }
     }
 
-    fn operations(&mut self, func: &Func, live: &[bool]) -> Result<Vec<Node>, Unsupported> {
+    fn operations(&mut self, func: &Func, live: &[bool]) -> Result<Vec<NodeId>, Unsupported> {
         let types = verify::types(func).expect("the function is sound");
-        let mut of: Vec<Node> = Vec::with_capacity(func.ops.len());
+        let mut of: Vec<NodeId> = Vec::with_capacity(func.ops.len());
         for (k, op) in func.ops.iter().enumerate() {
-            let node = if live[k] { self.node(func, *op, types[k], &of)? } else { Node(u32::MAX) };
+            let node = if live[k] { self.node(func, *op, types[k], &of)? } else { NodeId(u32::MAX) };
             of.push(node);
         }
         Ok(of)
     }
 
-    fn add(&mut self, op: MachineOp) -> Node {
+    fn add(&mut self, op: MachineOp) -> NodeId {
         if let Some(known) = self.known.get(&op) {
             return *known;
         }
         self.nodes.push(op);
-        let node = Node(self.nodes.len() as u32 - 1);
+        let node = NodeId(self.nodes.len() as u32 - 1);
         self.known.insert(op, node);
         node
     }
 
-    fn constant(&mut self, bits: u64) -> Node {
+    fn constant(&mut self, bits: u64) -> NodeId {
         self.add(MachineOp::Constant(bits))
     }
 
-    fn not(&mut self, mask: Node) -> MachineOp {
+    fn not(&mut self, mask: NodeId) -> MachineOp {
         match (self.nodes[mask.index()], self.width) {
             (MachineOp::Compare(predicate, a, b), _) => MachineOp::Compare(predicate.not(), a, b),
             (_, Vectors::Avx512) => MachineOp::MaskNot(mask),
@@ -333,7 +333,7 @@ impl Selection {
 
     /// `a` in lanes where a mask is set, `b` elsewhere. Without mask registers, if one of them is 0, a bitwise
     /// operation with the mask is enough.
-    fn select_lanes(&mut self, when: Node, a: Node, b: Node) -> MachineOp {
+    fn select_lanes(&mut self, when: NodeId, a: NodeId, b: NodeId) -> MachineOp {
         let zero = MachineOp::Constant(0);
         match (self.width, self.nodes[a.index()], self.nodes[b.index()]) {
             (Vectors::Avx | Vectors::Avx2, a, _) if a == zero => MachineOp::Binary(i::VANDNPD, false, when, b),
@@ -346,7 +346,7 @@ impl Selection {
         Unsupported(format!("{:?} has no {name}", self.width))
     }
 
-    fn node(&mut self, func: &Func, op: Op, of_type: Type, of: &[Node]) -> Result<Node, Unsupported> {
+    fn node(&mut self, func: &Func, op: Op, of_type: Type, of: &[NodeId]) -> Result<NodeId, Unsupported> {
         let at = |value: Value| of[value.index()];
         let has_masks = self.width == Vectors::Avx512;
         if let Some(x) = sign_of(op, |value| func.op(value)) {
@@ -448,7 +448,7 @@ impl Selection {
     }
 
     /// ±1 with the sign of x; x itself if it is ±0 or NaN.
-    fn sign(&mut self, x: Node) -> Node {
+    fn sign(&mut self, x: NodeId) -> NodeId {
         if self.width == Vectors::Avx512 {
             let kinds = self.constant(SIGN_RESPONSES);
             return self.add(MachineOp::Binary(i::VFIXUPIMMPD, false, x, kinds));
@@ -464,7 +464,7 @@ impl Selection {
     /// e^x with the bits of [`exponential::exp`], in fewer instructions. The power of two is applied last, by
     /// VSCALEFPD: it rounds a second time where the result is subnormal, as the algorithm does, and handles overflow.
     /// `not_positive`: x is known to be ≤ 0 or NaN. AVX-512 only.
-    fn exp(&mut self, x: Node, not_positive: bool) -> Node {
+    fn exp(&mut self, x: NodeId, not_positive: bool) -> NodeId {
         let number = |own: &mut Self, x: f64| own.constant(x.to_bits());
         // Below this bound the result is 0, and a mask excludes the lane from VSCALEFPD, which may take two hundred
         // cycles for an underflow. NaN is not excluded.
@@ -478,7 +478,7 @@ impl Selection {
             x = self.add(MachineOp::Binary(i::VMINPD, false, most, x));
         }
         let fused =
-            |own: &mut Self, signs: Signs, a: Node, b: Node, c: Node| own.add(MachineOp::Fma { signs, a, b, c });
+            |own: &mut Self, signs: Signs, a: NodeId, b: NodeId, c: NodeId| own.add(MachineOp::Fma { signs, a, b, c });
         // Here k counts multiples of ln 2 in steps of 1/64, where the algorithm counts multiples of ln 2 / 64. So the
         // floor of k is the exponent. The low six bits of `rounded` are the table index in both.
         let parts = f64::from(tables::EXP_LEN);
@@ -501,7 +501,7 @@ impl Selection {
     }
 
     /// Entries of a table of 64 by the low six bits of an integer.
-    fn table_of_64(&mut self, quarter: fn(u8) -> TableQuarter, index: Node) -> Node {
+    fn table_of_64(&mut self, quarter: fn(u8) -> TableQuarter, index: NodeId) -> NodeId {
         let [mut a, b, mut c, d] = [0, 1, 2, 3].map(|number| {
             let [first, second] = [false, true].map(|second| self.add(MachineOp::TableRow(quarter(number), second)));
             self.add(MachineOp::Permute(first, second, index))
@@ -516,7 +516,7 @@ impl Selection {
     }
 
     /// A table index that is clamped to the last entry, unless it is known to be in range.
-    fn clamped_index(&mut self, func: &Func, index: Value, len: u32, of: &[Node]) -> Node {
+    fn clamped_index(&mut self, func: &Func, index: Value, len: u32, of: &[NodeId]) -> NodeId {
         let is_masked = |value: Value| match func.op(value) {
             Op::Int(mask) => (0..i64::from(len)).contains(&mask),
             _ => false,

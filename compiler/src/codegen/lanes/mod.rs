@@ -24,7 +24,7 @@ use super::target::{FunctionCompiler, here};
 use super::unsupported::Unsupported;
 use crate::codegen::executable_memory::Executable;
 use crate::codegen::lanes::assembler::{Assembler, Base, Vectors, instructions};
-use crate::codegen::lanes::isel::{MachineOp, Node, select};
+use crate::codegen::lanes::isel::{MachineOp, NodeId, select};
 use crate::codegen::lanes::regalloc::{Home, RegisterAllocator, place_in};
 use crate::codegen::loop_plan::{LoopPlan, plan};
 use crate::hash::HashMap;
@@ -229,14 +229,14 @@ fn generate(
     let vector = width.bytes() as usize;
     let LoopPlan { carried, hoisted, prologue, body: body_order, last: final_order, areas, hoisted_at, end: spills_at } =
         plan(&nodes, layout.size(), vectors * vector);
-    let mut homes: HashMap<Node, Home> = HashMap::default();
+    let mut homes: HashMap<NodeId, Home> = HashMap::default();
     for (index, node) in nodes.nodes.iter().enumerate() {
         if let MachineOp::Load(slot) = node {
             let home = match carried.iter().position(|(known, _)| known == slot) {
                 Some(index) => Home { base: Base::Before, begin: 0, index },
                 None => Home { base: Base::Block, begin: 0, index: slot.index() },
             };
-            homes.insert(Node(index as u32), home);
+            homes.insert(NodeId(index as u32), home);
         }
     }
     let mut code = Assembler::new(width);
@@ -248,7 +248,7 @@ fn generate(
         code.load_table_address();
     }
     let mut spill_slots = 0;
-    let store_hoisted = |node: Node| {
+    let store_hoisted = |node: NodeId| {
         hoisted.iter().position(|known| *known == node).map(|index| Home {
             base: Base::Block,
             begin: hoisted_at,
@@ -289,11 +289,11 @@ fn generate(
     code.raw(&[0x48, 0x39, 0xd0]); // cmp rax, rdx
     let mut to_final = vec![code.jump(&[0x0f, 0x83])]; // jae
     if !carried.is_empty() {
-        let to_area = |node: Node| {
+        let to_area = |node: NodeId| {
             let of = carried.iter().enumerate().filter(|(_, (_, next))| *next == node);
             of.map(|(index, _)| Home { base: Base::After, begin: 0, index }).collect()
         };
-        let carried_values: Vec<Node> = carried.iter().map(|(_, node)| *node).collect();
+        let carried_values: Vec<NodeId> = carried.iter().map(|(_, node)| *node).collect();
         let mut body = RegisterAllocator::new(&mut code, &nodes, &body_order, &homes, width, vectors, spills_at);
         if let Some(failed) = nodes.failed {
             body.pin(failed);
@@ -310,7 +310,7 @@ fn generate(
     }
     let last = code.position();
     to_final.into_iter().for_each(|jump| code.bind(jump, last));
-    let to_block = |node: Node| {
+    let to_block = |node: NodeId| {
         let stores = nodes.stores.iter().filter(|(_, value)| *value == node);
         let mut homes: Vec<Home> =
             stores.map(|(slot, _)| Home { base: Base::Block, begin: 0, index: slot.index() }).collect();

@@ -9,7 +9,7 @@
 //! Source: Belady, *A Study of Replacement Algorithms for a Virtual-Storage Computer*, 1966.
 
 use crate::codegen::lanes::assembler::{Assembler, Base, Instruction, Place, Vectors, ZEROING, instructions as i};
-use crate::codegen::lanes::isel::{Direction, MachineOp, Node, Nodes, Signs};
+use crate::codegen::lanes::isel::{Direction, MachineOp, NodeId, Nodes, Signs};
 use crate::hash::HashMap;
 use crate::math;
 use std::ops::Range;
@@ -34,12 +34,12 @@ type VirtualRegister = usize;
 pub struct RegisterAllocator<'a> {
     code: &'a mut Assembler,
     nodes: &'a Nodes,
-    order: &'a [Node],
-    homes: &'a HashMap<Node, Home>,
+    order: &'a [NodeId],
+    homes: &'a HashMap<NodeId, Home>,
     width: Vectors,
     vectors: usize,
     /// For each node the positions in the order where it is read, ascending.
-    uses: HashMap<Node, Vec<usize>>,
+    uses: HashMap<NodeId, Vec<usize>>,
     /// The register of each virtual register that has one.
     register: HashMap<VirtualRegister, u8>,
     /// The spill slot of each virtual register that has one.
@@ -62,13 +62,13 @@ impl<'a> RegisterAllocator<'a> {
     pub fn new(
         code: &'a mut Assembler,
         nodes: &'a Nodes,
-        order: &'a [Node],
-        homes: &'a HashMap<Node, Home>,
+        order: &'a [NodeId],
+        homes: &'a HashMap<NodeId, Home>,
         width: Vectors,
         vectors: usize,
         spills_at: usize,
     ) -> RegisterAllocator<'a> {
-        let mut uses: HashMap<Node, Vec<usize>> = HashMap::default();
+        let mut uses: HashMap<NodeId, Vec<usize>> = HashMap::default();
         for (at, node) in order.iter().enumerate() {
             for operand in nodes.nodes[node.index()].operands() {
                 uses.entry(operand).or_default().push(at);
@@ -96,7 +96,7 @@ impl<'a> RegisterAllocator<'a> {
     }
 
     /// Keeps a node live to the end of the line.
-    pub fn pin(&mut self, node: Node) {
+    pub fn pin(&mut self, node: NodeId) {
         self.uses.entry(node).or_default().push(self.order.len() + 1);
     }
 
@@ -107,7 +107,7 @@ impl<'a> RegisterAllocator<'a> {
 
     /// Emits all nodes in order. `stores` says where a node is to be stored as soon as it is computed. Nodes of
     /// `stored_last` that are not in the order are stored at the end.
-    pub fn write(&mut self, stores: &dyn Fn(Node) -> Vec<Home>, stored_last: &[Node]) {
+    pub fn write(&mut self, stores: &dyn Fn(NodeId) -> Vec<Home>, stored_last: &[NodeId]) {
         let order = self.order;
         for (at, node) in order.iter().enumerate() {
             let homes = stores(*node);
@@ -121,7 +121,7 @@ impl<'a> RegisterAllocator<'a> {
                 self.end_instruction(*node);
             }
         }
-        let mut seen: Vec<Node> = order.to_vec();
+        let mut seen: Vec<NodeId> = order.to_vec();
         for node in stored_last {
             if seen.contains(node) {
                 continue;
@@ -140,7 +140,7 @@ impl<'a> RegisterAllocator<'a> {
 
     /// Emits a jump that is taken if any lane of a mask is set, at the end of the line; the target is still open.
     /// Returns the position of its displacement.
-    pub fn branch_if_any(&mut self, mask: Node) -> usize {
+    pub fn branch_if_any(&mut self, mask: NodeId) -> usize {
         self.now = (self.order.len(), 0);
         let all = self.in_register(mask);
         for k in 1..self.vectors {
@@ -168,21 +168,21 @@ impl<'a> RegisterAllocator<'a> {
         self.code.jump(&[0x0f, 0x85])
     }
 
-    fn virtual_register(&self, node: Node) -> VirtualRegister {
+    fn virtual_register(&self, node: NodeId) -> VirtualRegister {
         node.index() * self.vectors + if self.op(node).is_shared() { 0 } else { self.now.1 }
     }
 
-    fn op(&self, node: Node) -> MachineOp {
+    fn op(&self, node: NodeId) -> MachineOp {
         self.nodes.nodes[node.index()]
     }
 
-    fn is_mask(&self, node: Node) -> bool {
+    fn is_mask(&self, node: NodeId) -> bool {
         self.op(node).is_mask(self.width)
     }
 
     /// Position of the next use of a virtual register after the current instruction; larger is later.
     fn next_use(&self, virtual_register: VirtualRegister) -> Option<usize> {
-        let (node, k) = (Node((virtual_register / self.vectors) as u32), virtual_register % self.vectors);
+        let (node, k) = (NodeId((virtual_register / self.vectors) as u32), virtual_register % self.vectors);
         let (at, now) = self.now;
         let uses = self.uses.get(&node)?;
         if self.op(node).is_shared() {
@@ -211,7 +211,7 @@ impl<'a> RegisterAllocator<'a> {
 
     /// A register or memory operand for a node. A value in memory that is read again is loaded first, if a register is
     /// free until then: processors execute more arithmetic instructions than loads per cycle.
-    fn operand(&mut self, node: Node) -> Place {
+    fn operand(&mut self, node: NodeId) -> Place {
         let virtual_register = self.virtual_register(node);
         let mask = self.is_mask(node);
         if let Some(register) = self.register.get(&virtual_register) {
@@ -227,7 +227,7 @@ impl<'a> RegisterAllocator<'a> {
     }
 
     /// Loads a node from memory into a register.
-    fn load_into_register(&mut self, node: Node, place: Place) -> u8 {
+    fn load_into_register(&mut self, node: NodeId, place: Place) -> u8 {
         let mask = self.is_mask(node);
         let register = self.allocate(mask);
         self.load(node, register, place);
@@ -248,11 +248,11 @@ impl<'a> RegisterAllocator<'a> {
 
     /// Whether a virtual register can be read from memory.
     fn is_in_memory(&self, virtual_register: VirtualRegister) -> bool {
-        let node = Node((virtual_register / self.vectors) as u32);
+        let node = NodeId((virtual_register / self.vectors) as u32);
         self.op(node).is_shared() || self.homes.contains_key(&node) || self.spills.contains_key(&virtual_register)
     }
 
-    fn memory_operand(&mut self, node: Node) -> Place {
+    fn memory_operand(&mut self, node: NodeId) -> Place {
         match self.op(node) {
             MachineOp::Constant(bits) => return Place::Constant(bits),
             MachineOp::TableRow(table, second) => return self.code.row(table.row(second)),
@@ -266,14 +266,14 @@ impl<'a> RegisterAllocator<'a> {
     }
 
     /// The register of a node, which is loaded if necessary.
-    fn in_register(&mut self, node: Node) -> u8 {
+    fn in_register(&mut self, node: NodeId) -> u8 {
         match self.operand(node) {
             Place::Register(register) => register,
             place => self.load_into_register(node, place),
         }
     }
 
-    fn load(&mut self, node: Node, register: u8, place: Place) {
+    fn load(&mut self, node: NodeId, register: u8, place: Place) {
         match place {
             _ if self.is_mask(node) => self.code.mask(i::KMOVB_LOAD, register, 0, place),
             Place::Constant(_) if self.width == Vectors::Avx512 => {
@@ -283,7 +283,7 @@ impl<'a> RegisterAllocator<'a> {
         }
     }
 
-    fn store(&mut self, node: Node, register: u8, place: Place) {
+    fn store(&mut self, node: NodeId, register: u8, place: Place) {
         if self.is_mask(node) {
             self.code.mask(i::KMOVB_STORE, register, 0, place);
         } else {
@@ -328,7 +328,7 @@ impl<'a> RegisterAllocator<'a> {
         let table = if mask { &mut self.mask_of } else { &mut self.vector_of };
         let virtual_register = table[register as usize].take().expect("a value is in it");
         self.register.remove(&virtual_register);
-        let node = Node((virtual_register / self.vectors) as u32);
+        let node = NodeId((virtual_register / self.vectors) as u32);
         if self.next_use(virtual_register).is_some() && !self.is_in_memory(virtual_register) {
             let number = self.free_spill_slot();
             self.spills.insert(virtual_register, number);
@@ -337,7 +337,7 @@ impl<'a> RegisterAllocator<'a> {
     }
 
     /// Frees the register and the spill slot of a value that is not read any more.
-    fn release(&mut self, node: Node) {
+    fn release(&mut self, node: NodeId) {
         let virtual_register = self.virtual_register(node);
         if self.next_use(virtual_register).is_some() {
             return;
@@ -355,20 +355,20 @@ impl<'a> RegisterAllocator<'a> {
     }
 
     /// Ends the current instruction.
-    fn end_instruction(&mut self, node: Node) {
+    fn end_instruction(&mut self, node: NodeId) {
         self.locked.clear();
         self.release(node);
         self.free_spills.append(&mut self.freed_by_instruction);
     }
 
     /// A register for the result; it may be that of an operand that is not read any more.
-    fn result(&mut self, node: Node) -> u8 {
+    fn result(&mut self, node: NodeId) -> u8 {
         self.op(node).operands().for_each(|operand| self.release(operand));
         self.fresh_register(node)
     }
 
     /// A register for the result, different from those of the operands.
-    fn fresh_register(&mut self, node: Node) -> u8 {
+    fn fresh_register(&mut self, node: NodeId) -> u8 {
         let mask = self.is_mask(node);
         let register = self.allocate(mask);
         let virtual_register = self.virtual_register(node);
@@ -377,7 +377,7 @@ impl<'a> RegisterAllocator<'a> {
     }
 
     /// Locks the registers of operands, so that loading another operand does not evict them.
-    fn lock(&mut self, operands: impl Iterator<Item = Node>) {
+    fn lock(&mut self, operands: impl Iterator<Item = NodeId>) {
         for operand in operands {
             if let Some(register) = self.register.get(&self.virtual_register(operand)) {
                 self.locked.push((self.is_mask(operand), *register));
@@ -385,7 +385,7 @@ impl<'a> RegisterAllocator<'a> {
         }
     }
 
-    fn node(&mut self, node: Node) {
+    fn node(&mut self, node: NodeId) {
         let op = self.op(node);
         let virtual_register = self.virtual_register(node);
         if self.register.contains_key(&virtual_register) || self.spills.contains_key(&virtual_register) {
@@ -499,8 +499,8 @@ impl<'a> RegisterAllocator<'a> {
             MachineOp::Gather { index, .. } => {
                 // Up to four tables that are read at the same index are looked up together.
                 let same =
-                    |other: &&Node| matches!(self.op(**other), MachineOp::Gather { index: at, .. } if at == index);
-                let all: Vec<Node> = self.order[self.now.0..].iter().filter(same).take(4).copied().collect();
+                    |other: &&NodeId| matches!(self.op(**other), MachineOp::Gather { index: at, .. } if at == index);
+                let all: Vec<NodeId> = self.order[self.now.0..].iter().filter(same).take(4).copied().collect();
                 self.look_up(&all, index);
                 self.release(index);
             }
@@ -509,9 +509,9 @@ impl<'a> RegisterAllocator<'a> {
 
     /// Loads entries of tables at the same index. Two tables of elementary functions, whose contents are known here,
     /// are interleaved, so that one load fetches both entries.
-    fn look_up(&mut self, all: &[Node], index: Node) {
+    fn look_up(&mut self, all: &[NodeId], index: NodeId) {
         let nodes = self.nodes;
-        let table = |node: &Node| match self.op(*node) {
+        let table = |node: &NodeId| match self.op(*node) {
             MachineOp::Gather { base, len, .. } => base as usize..(base + len) as usize,
             _ => unreachable!("all are alike"),
         };
@@ -548,7 +548,7 @@ impl<'a> RegisterAllocator<'a> {
         }
     }
 
-    fn two(&mut self, node: Node, instruction: Instruction, exchange: bool, a: Node, b: Node) {
+    fn two(&mut self, node: NodeId, instruction: Instruction, exchange: bool, a: NodeId, b: NodeId) {
         let (first, last) = match (self.operand(a), self.operand(b)) {
             (Place::Register(a), last) => (a, last),
             (last, Place::Register(b)) if exchange => (b, last),
@@ -571,7 +571,7 @@ impl<'a> RegisterAllocator<'a> {
     }
 
     /// The instruction overwrites one of its three operands, and one of the others may be in memory.
-    fn fma(&mut self, node: Node, signs: Signs, a: Node, b: Node, c: Node) {
+    fn fma(&mut self, node: NodeId, signs: Signs, a: NodeId, b: NodeId, c: NodeId) {
         let all = [a, b, c];
         let places = all.map(|operand| self.operand(operand));
         let held = |k: usize| matches!(places[k], Place::Register(_));
@@ -614,7 +614,7 @@ impl<'a> RegisterAllocator<'a> {
     #[allow(clippy::too_many_arguments)]
     fn fused(
         &mut self,
-        node: Node,
+        node: NodeId,
         signs: Signs,
         over: usize,
         others: [usize; 2],

@@ -4,15 +4,15 @@
 //!
 //! Source: Sethi, Ullman, *The Generation of Optimal Code for Arithmetic Expressions*, JACM, 1970.
 
-use crate::codegen::lanes::isel::{MachineOp, Node, Nodes};
-use crate::codegen::loop_plan::Line;
+use crate::codegen::lanes::isel::{MachineOp, NodeId, Nodes};
+use crate::codegen::loop_plan::StraightLine;
 use crate::ir::scc::topological_order;
 use abi::Slot;
 
 /// Orders those of the `wanted` nodes that `roots` need, loads and constants excepted. The nodes of each root are
 /// adjacent, operands first. Of several operands the one that needs most registers comes first.
-fn schedule(nodes: &Nodes, roots: &[Node], wanted: &[bool]) -> Vec<Node> {
-    let is_read = |node: Node| !wanted[node.index()] || nodes.nodes[node.index()].is_leaf();
+fn schedule(nodes: &Nodes, roots: &[NodeId], wanted: &[bool]) -> Vec<NodeId> {
+    let is_read = |node: NodeId| !wanted[node.index()] || nodes.nodes[node.index()].is_leaf();
     // Sethi–Ullman number: registers that computing a node takes, if no value is shared.
     let mut need = vec![0; nodes.nodes.len()];
     for (index, node) in nodes.nodes.iter().enumerate() {
@@ -20,32 +20,32 @@ fn schedule(nodes: &Nodes, roots: &[Node], wanted: &[bool]) -> Vec<Node> {
         let mut of: Vec<usize> = node.operands().map(|operand| need[operand.index()]).collect();
         of.sort_unstable_by(|a, b| b.cmp(a));
         let most = of.iter().enumerate().map(|(before, need)| need + before).max();
-        need[index] = if is_read(Node(index as u32)) { 0 } else { most.unwrap_or(0).max(1) };
+        need[index] = if is_read(NodeId(index as u32)) { 0 } else { most.unwrap_or(0).max(1) };
     }
-    let operands = |node: Node| {
-        let mut operands: Vec<Node> = nodes.nodes[node.index()].operands().collect();
+    let operands = |node: NodeId| {
+        let mut operands: Vec<NodeId> = nodes.nodes[node.index()].operands().collect();
         operands.sort_by_key(|operand| std::cmp::Reverse(need[operand.index()]));
         operands
     };
-    topological_order(roots, nodes.nodes.len(), Node::index, is_read, operands)
+    topological_order(roots, nodes.nodes.len(), NodeId::index, is_read, operands)
 }
 
-impl Line for Nodes {
-    type Node = Node;
+impl StraightLine for Nodes {
+    type Node = NodeId;
 
     fn count(&self) -> usize {
         self.nodes.len()
     }
 
-    fn index(node: Node) -> usize {
+    fn index(node: NodeId) -> usize {
         node.index()
     }
 
-    fn operands(&self, index: usize) -> Vec<Node> {
+    fn operands(&self, index: usize) -> Vec<NodeId> {
         self.nodes[index].operands().collect()
     }
 
-    fn is_leaf(&self, node: Node) -> bool {
+    fn is_leaf(&self, node: NodeId) -> bool {
         self.nodes[node.index()].is_leaf()
     }
 
@@ -53,19 +53,19 @@ impl Line for Nodes {
         if let MachineOp::Load(slot) = self.nodes[index] { Some(slot) } else { None }
     }
 
-    fn stores(&self) -> &[(Slot, Node)] {
+    fn stores(&self) -> &[(Slot, NodeId)] {
         &self.stores
     }
 
-    fn status(&self) -> Option<Node> {
+    fn status(&self) -> Option<NodeId> {
         self.status
     }
 
-    fn failed(&self) -> Option<Node> {
+    fn failed(&self) -> Option<NodeId> {
         self.failed
     }
 
-    fn schedule(&self, roots: &[Node], wanted: &[bool]) -> Vec<Node> {
+    fn schedule(&self, roots: &[NodeId], wanted: &[bool]) -> Vec<NodeId> {
         schedule(self, roots, wanted)
     }
 }

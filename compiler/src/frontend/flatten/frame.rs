@@ -12,7 +12,7 @@ pub struct Frame<'a> {
     /// File of the rig.
     pub file: FileId,
     /// Drives and devices.
-    pub nodes: Vec<Node<'a>>,
+    pub nodes: Vec<BusNode<'a>>,
     /// Drives and devices with invalid descriptions, which have been reported.
     pub broken: Vec<&'a Name>,
     /// Observers and filters of the rig.
@@ -24,7 +24,7 @@ pub struct Frame<'a> {
 }
 
 /// A drive or device. Its inputs are the signals read from the bus.
-pub struct Node<'a> {
+pub struct BusNode<'a> {
     /// Its name in the rig.
     pub name: &'a Name,
     /// Its description as a model.

@@ -21,7 +21,7 @@ use grammar::diagnostic::{Diagnostic, Recurring};
 use grammar::span::{FileId, Span};
 use std::rc::Rc;
 
-pub use frame::{Frame, Node as BusNode, RigFrame, Scope};
+pub use frame::{BusNode, Frame, RigFrame, Scope};
 
 /// Limit on the quantities of one instance with all its parts.
 pub const MOST_VARS: usize = 200_000;

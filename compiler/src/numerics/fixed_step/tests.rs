@@ -45,21 +45,21 @@ fn lugre<'a>(v: Real<'a>, z: Real<'a>, sigma1: f64) -> (Real<'a>, Real<'a>) {
     (rate, 1e5 * z + sigma1 * rate + 0.4 * v)
 }
 
-struct Run {
+struct TestRun {
     code: Code,
     block: Vec<f64>,
     layout: Layout,
 }
 
-impl Run {
-    fn new(program: &Program, method: Method, h: f64, x: &[f64]) -> Run {
+impl TestRun {
+    fn new(program: &Program, method: Method, h: f64, x: &[f64]) -> TestRun {
         let layout = program.description.layout.clone();
         let step = expand(&step(program, method));
         let code = Code::Machine(compile(&[(Function::Step, step)], &layout, POOL.len()).unwrap().0);
         let mut block = vec![0.0; layout.size()];
         block[Slot::STEP.index()] = h;
         block[layout.states.range()].copy_from_slice(x);
-        Run { code, block, layout }
+        TestRun { code, block, layout }
     }
 
     fn advance(&mut self, n: u64) -> u64 {
@@ -79,7 +79,7 @@ fn methods_have_their_orders() {
         (vec![c + x[0] * s * 0.5 - x[1], x[0] - 0.7 * x[1]], x[0])
     });
     let end = |method, n: u64| {
-        let mut run = Run::new(&program, method, 1.0 / n as f64, &[0.3, -0.2]);
+        let mut run = TestRun::new(&program, method, 1.0 / n as f64, &[0.3, -0.2]);
         run.advance(n);
         [run.x(0), run.x(1)]
     };
@@ -98,7 +98,7 @@ fn methods_have_their_orders() {
 fn expo_is_exact_for_a_state_that_relaxes() {
     let program = program(1, |_, x| (vec![2.0 - 50.0 * x[0]], x[0]));
     for h in [1e-6, 1e-3, 0.1, 10.0] {
-        let mut run = Run::new(&program, Method::Expo, h, &[1.0]);
+        let mut run = TestRun::new(&program, Method::Expo, h, &[1.0]);
         run.advance(1);
         let exact = 0.04 + 0.96 * core_math::exp(-50.0 * h);
         assert!((run.x(0) - exact).abs() < 1e-14, "h = {h}: {} and not {exact}", run.x(0));
@@ -113,7 +113,7 @@ fn expo_is_exact_for_coupled_linear_states() {
         (vec![x[1], force, x[3], t * 0.0 + 3.0], x[0])
     });
     let end = |method, n: u64| {
-        let mut run = Run::new(&program, method, 2.0 / n as f64, &[0.3, -0.2, 0.1, 0.7]);
+        let mut run = TestRun::new(&program, method, 2.0 / n as f64, &[0.3, -0.2, 0.1, 0.7]);
         run.advance(n);
         [run.x(0), run.x(1)]
     };
@@ -136,7 +136,7 @@ fn expo_evaluates_switching_conditions_mid_step() {
         })
     };
     let mean = |n: u64, of: &dyn Fn(u64, f64) -> f64| {
-        let mut run = Run::new(&program(20.0), Method::Expo, 10.0 / n as f64, &[0.0]);
+        let mut run = TestRun::new(&program(20.0), Method::Expo, 10.0 / n as f64, &[0.0]);
         let errors = (0..32).map(|k| {
             run.advance(n / 32);
             of(k, run.x(0))
@@ -153,7 +153,7 @@ fn expo_evaluates_switching_conditions_mid_step() {
     let order = (coarse / fine).log2() / 4.0;
     assert!((1.8..2.3).contains(&order), "order {order}, errors {coarse} and {fine}");
     // For any stiffness, the state does not pass the stop, and it leaves as soon as it is pulled back.
-    let mut run = Run::new(&program(1e9), Method::Expo, 0.01, &[0.0]);
+    let mut run = TestRun::new(&program(1e9), Method::Expo, 0.01, &[0.0]);
     let course: Vec<f64> = (0..628).map(|_| (run.advance(1), run.x(0)).1).collect();
     let most = course.iter().copied().fold(0.0, f64::max);
     assert!(most > 0.3 && most < 0.3 + 1e-8, "{most}");
@@ -164,7 +164,7 @@ fn expo_evaluates_switching_conditions_mid_step() {
 #[test]
 fn a_state_attracted_to_a_jump_stays_near_it() {
     let program = program(1, |_, x| (vec![x[0].above(0.0).choose(-1.0, 1.0)], x[0]));
-    let mut run = Run::new(&program, Method::Expo, 0.1, &[0.96]);
+    let mut run = TestRun::new(&program, Method::Expo, 0.1, &[0.96]);
     run.advance(9);
     assert!((run.x(0) - 0.06).abs() < 1e-12, "{}", run.x(0));
     for _ in 0..100 {
@@ -182,7 +182,7 @@ fn driven_bristle_agrees_with_the_published_table() {
         (vec![rate], force)
     });
     let largest = |method, h: f64| {
-        let mut run = Run::new(&program, method, h, &[0.0]);
+        let mut run = TestRun::new(&program, method, h, &[0.0]);
         let steps = (2.0 / h).round() as u64;
         (0..steps).fold(0f64, |largest, _| {
             run.advance(1);
@@ -212,7 +212,7 @@ fn coasting_down_conserves_momentum() {
         let (rate, force) = lugre(x[1], x[2], 1e5f64.sqrt());
         (vec![x[1], -force, rate], force)
     });
-    let mut run = Run::new(&program, Method::Expo, 1e-3, &[0.0, 1.0, 0.0]);
+    let mut run = TestRun::new(&program, Method::Expo, 1e-3, &[0.0, 1.0, 0.0]);
     run.advance(3000);
     assert!((run.x(0) - 0.394793).abs() < 1e-6, "{}", run.x(0));
 }
@@ -226,7 +226,7 @@ fn pulling_agrees_with_an_independent_program() {
         (vec![x[1], 2.0 * (0.1 * t - x[0]) - force, rate], force)
     });
     let end = |method, h: f64| {
-        let mut run = Run::new(&program, method, h, &[0.0; 3]);
+        let mut run = TestRun::new(&program, method, h, &[0.0; 3]);
         run.advance((40.0 / h).round() as u64);
         run.x(0)
     };
@@ -267,7 +267,7 @@ fn hunting_agrees_with_an_independent_program() {
         (Method::Implicit, 1e-3, 126.406),
         (Method::Implicit, 2e-3, 126.401),
     ] {
-        let mut run = Run::new(&program, method, h, &[0.0; 5]);
+        let mut run = TestRun::new(&program, method, h, &[0.0; 5]);
         let steps = (50.0 / h).round() as u64;
         run.advance(steps);
         let (mut low, mut high) = (f64::INFINITY, f64::NEG_INFINITY);
@@ -286,8 +286,8 @@ fn hunting_agrees_with_an_independent_program() {
 fn a_singular_step_falls_back_to_expo() {
     let gamma = 1.0 - std::f64::consts::FRAC_1_SQRT_2;
     let program = program(1, move |_, x| (vec![x[0] * (1.0 / gamma)], x[0]));
-    let mut run = Run::new(&program, Method::Implicit, 1.0, &[1.0]);
-    let mut expo = Run::new(&program, Method::Expo, 1.0, &[1.0]);
+    let mut run = TestRun::new(&program, Method::Implicit, 1.0, &[1.0]);
+    let mut expo = TestRun::new(&program, Method::Expo, 1.0, &[1.0]);
     run.advance(1);
     expo.advance(1);
     assert_eq!(run.x(0), expo.x(0));
@@ -312,7 +312,7 @@ fn time_is_count_times_step_and_sampled_blocks_run_on_time() {
     program.description.ticks = vec![Tick { period, due }];
     program.description.automata =
         vec![Automaton { path: String::new(), regimes: Vec::new(), slot: layout.regimes.slot(0) }];
-    let mut run = Run::new(&program, Method::Euler, 1e-3, &[0.0]);
+    let mut run = TestRun::new(&program, Method::Euler, 1e-3, &[0.0]);
     run.block[period.index()] = 7e-3;
     run.advance(10_000);
     assert_eq!(run.block[Slot::COUNT.index()], 10_000.0);
@@ -333,14 +333,14 @@ fn the_status_names_the_first_failed_guard() {
         guard(layout.states.slot(1), (f64::NEG_INFINITY, f64::INFINITY)),
     ];
     // Starts within the tolerance of 3e-6 below the range, and ends at 4.
-    let mut run = Run::new(&program, Method::Euler, 1.0, &[2e-6, 1.0]);
+    let mut run = TestRun::new(&program, Method::Euler, 1.0, &[2e-6, 1.0]);
     assert_eq!(run.advance(100), 2);
     assert_eq!(run.block[Slot::COUNT.index()], 4.0);
-    let mut run = Run::new(&program, Method::Euler, 1.0, &[0.0, 0.0]);
+    let mut run = TestRun::new(&program, Method::Euler, 1.0, &[0.0, 0.0]);
     assert_eq!((run.advance(100), run.block[Slot::COUNT.index()]), (1, 1.0));
-    let mut run = Run::new(&program, Method::Euler, 1.0, &[0.0, f64::INFINITY]);
+    let mut run = TestRun::new(&program, Method::Euler, 1.0, &[0.0, f64::INFINITY]);
     assert_eq!(run.advance(100), 3);
-    let mut run = Run::new(&program, Method::Euler, 1.0, &[-2.0, 1.0]);
+    let mut run = TestRun::new(&program, Method::Euler, 1.0, &[-2.0, 1.0]);
     assert_eq!(run.advance(100), 2);
 }
 
@@ -350,7 +350,7 @@ fn bounds_on_both_sides_also_catch_nan() {
     for (range, far) in [((-2.0, 2.0), -2.1), ((-1.0, 2.0), -1.1), ((-1.0, 2.0), 2.1)] {
         let mut program = program(1, |_, x| (vec![x[0] * 0.0], x[0]));
         program.description.guards = vec![Guard { slot: program.description.layout.states.slot(0), ..guard(range) }];
-        let status = |x: f64| Run::new(&program, Method::Euler, 1.0, &[x]).advance(1);
+        let status = |x: f64| TestRun::new(&program, Method::Euler, 1.0, &[x]).advance(1);
         for x in [0.0, -0.9, 2.0, 2.000001] {
             assert_eq!(status(x), 0, "{x} in {range:?}");
         }
@@ -407,7 +407,7 @@ fn only_a_model_that_uses_time_stores_it() {
 #[test]
 fn a_decayed_state_becomes_zero() {
     let program = program(1, |_, x| (vec![-1.0 * x[0]], x[0]));
-    let mut run = Run::new(&program, Method::Euler, 0.5, &[1e-29]);
+    let mut run = TestRun::new(&program, Method::Euler, 0.5, &[1e-29]);
     run.advance(3);
     assert!(run.x(0) > 0.0);
     run.advance(1);

@@ -7,7 +7,7 @@ use crate::rng::Chance;
 
 /// Kind of a fault.
 #[derive(Clone, Copy, PartialEq, Debug)]
-pub enum Kind {
+pub enum BusFaultKind {
     /// A frame of the node never reaches the line.
     Drop,
     /// One data bit is wrong, under a valid checksum: no node on the bus notices.
@@ -32,19 +32,19 @@ pub enum Kind {
 /// A fault of one node: its kind, the affected frames, their number, and the time.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub struct Fault {
-    kind: Kind,
+    kind: BusFaultKind,
     id: Option<u32>,
     chance: f64,
     from_ns: u64,
     until_ns: u64,
     times: u32,
-    /// The first frame that a [`Kind::Stale`] has hit.
+    /// The first frame that a [`BusFaultKind::Stale`] has hit.
     frozen: Option<Frame>,
 }
 
 impl Fault {
     /// A fault that affects every frame, at any time.
-    pub fn new(kind: Kind) -> Fault {
+    pub fn new(kind: BusFaultKind) -> Fault {
         Fault { kind, id: None, chance: 1.0, from_ns: 0, until_ns: u64::MAX, times: u32::MAX, frozen: None }
     }
 
@@ -97,7 +97,8 @@ impl Faults {
 
     /// The frame to send instead of this one: the stale one of a frozen producer, or the frame itself.
     pub fn frozen(&mut self, frame: Frame, now_ns: u64, chance: &mut Chance) -> Frame {
-        let mut strikes = |fault: &mut Fault| fault.kind == Kind::Stale && fault.strikes(&frame, now_ns, chance);
+        let mut strikes =
+            |fault: &mut Fault| fault.kind == BusFaultKind::Stale && fault.strikes(&frame, now_ns, chance);
         match self.0.iter_mut().find_map(|fault| strikes(fault).then_some(fault)) {
             Some(fault) => *fault.frozen.get_or_insert(frame),
             None => frame,
@@ -110,8 +111,8 @@ impl Faults {
         frame: &Frame,
         now_ns: u64,
         chance: &mut Chance,
-        is: impl Fn(Kind) -> bool,
-    ) -> Option<Kind> {
+        is: impl Fn(BusFaultKind) -> bool,
+    ) -> Option<BusFaultKind> {
         self.0.iter_mut().find_map(|fault| {
             let struck = is(fault.kind) && fault.strikes(frame, now_ns, chance);
             struck.then_some(fault.kind)

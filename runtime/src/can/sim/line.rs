@@ -5,7 +5,7 @@
 //! 11898-1:2015, 10.8, 12.
 
 use super::super::{Event, Filter, Frame, Health, Received, Refused, State};
-use super::fault::{Fault, Faults, Kind, corrupted};
+use super::fault::{BusFaultKind, Fault, Faults, corrupted};
 use crate::can::frame_length;
 use crate::rng::Chance;
 use std::collections::VecDeque;
@@ -25,10 +25,10 @@ const SUSPEND: u32 = 8;
 /// Number of recessive bits before a node may recover from bus-off.
 const RECOVERY: u32 = 128 * 11;
 
-pub(super) struct Line {
+pub(super) struct Wire {
     bit_rate: u32,
     chance: Chance,
-    nodes: Vec<Node>,
+    nodes: Vec<Station>,
     /// Time from which on a frame may start.
     free_ns: u64,
     underway: Option<Underway>,
@@ -55,7 +55,7 @@ enum Ending {
     Disturbed,
 }
 
-struct Node {
+struct Station {
     name: String,
     bit_rate: u32,
     listen_only: bool,
@@ -83,7 +83,7 @@ struct Babble {
     until_ns: u64,
 }
 
-impl Node {
+impl Station {
     /// Whether it drives the line and receives from it.
     fn takes_part(&self, now_ns: u64) -> bool {
         let unplugged = (self.unplugged.0..self.unplugged.1).contains(&now_ns);
@@ -160,9 +160,9 @@ impl Node {
     }
 }
 
-impl Line {
-    pub fn new(bit_rate: u32, seed: u64) -> Line {
-        Line {
+impl Wire {
+    pub fn new(bit_rate: u32, seed: u64) -> Wire {
+        Wire {
             bit_rate,
             chance: Chance(seed),
             nodes: Vec::new(),
@@ -174,7 +174,7 @@ impl Line {
     }
 
     pub fn join(&mut self, name: &str, bit_rate: Option<u32>, filter: Filter, listen_only: bool, now_ns: u64) -> usize {
-        self.nodes.push(Node {
+        self.nodes.push(Station {
             name: name.to_string(),
             bit_rate: bit_rate.unwrap_or(self.bit_rate),
             listen_only,
@@ -209,7 +209,7 @@ impl Line {
     }
 
     /// The nodes with this name.
-    fn named(&mut self, name: &str) -> impl Iterator<Item = &mut Node> {
+    fn named(&mut self, name: &str) -> impl Iterator<Item = &mut Station> {
         let known = self.nodes.iter().any(|node| node.name == name);
         assert!(known, "no node {name} has joined this bus");
         self.nodes.iter_mut().filter(move |node| node.name == name)
@@ -253,21 +253,21 @@ impl Line {
             node.health.refused += 1;
             return Err(Refused::Down);
         }
-        let mut struck = |is: fn(Kind) -> bool| node.faults.strike(&frame, now_ns, chance, is);
-        if struck(|kind| kind == Kind::Full).is_some() || node.waiting.len() >= QUEUE {
+        let mut struck = |is: fn(BusFaultKind) -> bool| node.faults.strike(&frame, now_ns, chance, is);
+        if struck(|kind| kind == BusFaultKind::Full).is_some() || node.waiting.len() >= QUEUE {
             node.health.refused += 1;
             return Err(Refused::Full);
         }
-        if struck(|kind| kind == Kind::Drop).is_some() {
+        if struck(|kind| kind == BusFaultKind::Drop).is_some() {
             return Ok(());
         }
-        let delayed = match struck(|kind| matches!(kind, Kind::Delay(_))) {
-            Some(Kind::Delay(by_ns)) => by_ns,
+        let delayed = match struck(|kind| matches!(kind, BusFaultKind::Delay(_))) {
+            Some(BusFaultKind::Delay(by_ns)) => by_ns,
             _ => 0,
         };
-        let twice = struck(|kind| kind == Kind::Duplicate).is_some();
-        let held_back = struck(|kind| kind == Kind::Reorder).is_some();
-        let corrupt = struck(|kind| kind == Kind::Corrupt).is_some();
+        let twice = struck(|kind| kind == BusFaultKind::Duplicate).is_some();
+        let held_back = struck(|kind| kind == BusFaultKind::Reorder).is_some();
+        let corrupt = struck(|kind| kind == BusFaultKind::Corrupt).is_some();
         let frame = node.faults.frozen(frame, now_ns, chance);
         let frame = if corrupt { corrupted(chance, frame) } else { frame };
         if held_back && node.held.is_none() {
@@ -311,8 +311,8 @@ impl Line {
     }
 
     fn next_start_ns(&self) -> Option<u64> {
-        let able = |node: &&Node| node.joined && !matches!(node.health.state, State::BusOff | State::Down);
-        let wants = self.nodes.iter().filter(able).filter_map(Node::wants_ns).min()?;
+        let able = |node: &&Station| node.joined && !matches!(node.health.state, State::BusOff | State::Down);
+        let wants = self.nodes.iter().filter(able).filter_map(Station::wants_ns).min()?;
         (wants < u64::MAX).then(|| wants.max(self.free_ns))
     }
 
@@ -348,10 +348,10 @@ impl Line {
 
     /// Performs the arbitration between the nodes that want to start, and starts the winner's frame.
     fn start(&mut self, start_ns: u64) {
-        let offers = |(at, node): (usize, &Node)| node.offers(start_ns).map(|(frame, place)| (at, frame, place));
+        let offers = |(at, node): (usize, &Station)| node.offers(start_ns).map(|(frame, place)| (at, frame, place));
         let plugged = |&(at, ..): &(usize, Frame, Option<usize>)| self.nodes[at].takes_part(start_ns);
         let able =
-            |&(_, node): &(usize, &Node)| node.joined && !matches!(node.health.state, State::BusOff | State::Down);
+            |&(_, node): &(usize, &Station)| node.joined && !matches!(node.health.state, State::BusOff | State::Down);
         let all = || self.nodes.iter().enumerate().filter(able).filter_map(offers);
         let Some((at, frame, place)) =
             all().filter(plugged).min_by_key(|(_, frame, _)| frame_length::arbitration(frame))
@@ -370,7 +370,7 @@ impl Line {
         let acknowledged = others().any(|(_, node)| node.bit_rate == rate && !node.listen_only);
         let whole = frame_length::bits(&frame);
         let shorted = (self.short.0..self.short.1).contains(&start_ns);
-        let struck = |kind| kind == Kind::Disturb;
+        let struck = |kind| kind == BusFaultKind::Disturb;
         let disturbed = self.nodes[at].faults.strike(&frame, start_ns, &mut self.chance, struck).is_some();
         let (end, error_at) = if shorted || misread {
             (Ending::Disturbed, Some(6))
@@ -452,7 +452,7 @@ impl Line {
                     if !node.filter.accepts(&frame) {
                         continue;
                     }
-                    match node.faults.strike(&frame, ends_ns, chance, |kind| kind == Kind::Overrun) {
+                    match node.faults.strike(&frame, ends_ns, chance, |kind| kind == BusFaultKind::Overrun) {
                         Some(_) => {
                             node.unreported += 1;
                             node.health.lost += 1;

@@ -17,8 +17,8 @@ mod line;
 
 use super::{Bus, Filter, Frame, Health, Received, Refused, descriptor};
 use crate::realtime::clock::{Clock, Monotonic, Simulated};
-pub use fault::{Fault, Kind};
-use line::Line;
+pub use fault::{BusFaultKind, Fault};
+use line::Wire;
 use std::cell::{Cell, RefCell};
 use std::rc::Rc;
 
@@ -82,7 +82,7 @@ impl Simulation {
             return bus.clone();
         }
         let seed = self.0.seed.get().wrapping_add(buses.len() as u64);
-        let line = Rc::new(RefCell::new(Line::new(bit_rate, seed)));
+        let line = Rc::new(RefCell::new(Wire::new(bit_rate, seed)));
         buses.push(SimBus { name: name.into(), line, time: Rc::downgrade(&self.0) });
         buses[buses.len() - 1].clone()
     }
@@ -177,7 +177,7 @@ impl World {
 #[derive(Clone)]
 pub struct SimBus {
     name: Rc<str>,
-    line: Rc<RefCell<Line>>,
+    line: Rc<RefCell<Wire>>,
     // A simulation owns its buses, and its actors own ports: a strong reference would be a cycle.
     time: std::rc::Weak<World>,
 }
@@ -258,7 +258,7 @@ impl SimBus {
         self.time.upgrade().expect("a simulation outlives the use of its buses")
     }
 
-    fn caught_up(&self) -> std::cell::RefMut<'_, Line> {
+    fn caught_up(&self) -> std::cell::RefMut<'_, Wire> {
         let mut line = self.line.borrow_mut();
         line.run_to(self.world().now_ns(), false);
         line

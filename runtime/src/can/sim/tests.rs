@@ -117,7 +117,7 @@ fn another_bit_rate_is_an_error_on_both_sides() {
 #[test]
 fn a_disturbed_frame_is_counted_and_retransmitted() {
     let (simulation, bus, mut a, mut b) = pair();
-    bus.plant("a", Fault::new(Kind::Disturb).times(3));
+    bus.plant("a", Fault::new(BusFaultKind::Disturb).times(3));
     a.send(Frame::new(1, &[7])).expect("sent");
     simulation.run_to(1_000_000);
     assert_eq!(frames(&mut b).len(), 1);
@@ -143,24 +143,24 @@ fn planted_faults_do_what_they_say() {
         simulation.run_to(10_000_000);
         (sent, frames(&mut b).iter().map(|(frame, _)| frame.data()[0]).collect::<Vec<_>>())
     };
-    assert_eq!(got(Fault::new(Kind::Drop).times(1), 3), (3, vec![1, 2]));
-    assert_eq!(got(Fault::new(Kind::Duplicate).times(1), 2), (2, vec![0, 0, 1]));
-    assert_eq!(got(Fault::new(Kind::Reorder).times(1), 3), (3, vec![1, 0, 2]));
-    assert_eq!(got(Fault::new(Kind::Delay(1_000_000)).times(1), 3), (3, vec![1, 2, 0]));
-    assert_eq!(got(Fault::new(Kind::Full).times(2), 3), (1, vec![2]));
-    assert_eq!(got(Fault::new(Kind::Drop).id(2), 2), (2, vec![0, 1]));
-    assert_eq!(got(Fault::new(Kind::Drop).from(1), 2), (2, vec![0, 1]));
-    let (_, corrupt) = got(Fault::new(Kind::Corrupt), 1);
+    assert_eq!(got(Fault::new(BusFaultKind::Drop).times(1), 3), (3, vec![1, 2]));
+    assert_eq!(got(Fault::new(BusFaultKind::Duplicate).times(1), 2), (2, vec![0, 0, 1]));
+    assert_eq!(got(Fault::new(BusFaultKind::Reorder).times(1), 3), (3, vec![1, 0, 2]));
+    assert_eq!(got(Fault::new(BusFaultKind::Delay(1_000_000)).times(1), 3), (3, vec![1, 2, 0]));
+    assert_eq!(got(Fault::new(BusFaultKind::Full).times(2), 3), (1, vec![2]));
+    assert_eq!(got(Fault::new(BusFaultKind::Drop).id(2), 2), (2, vec![0, 1]));
+    assert_eq!(got(Fault::new(BusFaultKind::Drop).from(1), 2), (2, vec![0, 1]));
+    let (_, corrupt) = got(Fault::new(BusFaultKind::Corrupt), 1);
     assert!(corrupt.len() == 1 && corrupt[0].count_ones() == 1, "one bit of 0 is wrong: {corrupt:?}");
-    let (_, half) = got(Fault::new(Kind::Drop).chance(0.5), 60);
+    let (_, half) = got(Fault::new(BusFaultKind::Drop).chance(0.5), 60);
     assert!((15..45).contains(&half.len()), "{} of 60", half.len());
-    assert_eq!(got(Fault::new(Kind::Drop).chance(0.5), 60).1, half, "the same seed, the same losses");
+    assert_eq!(got(Fault::new(BusFaultKind::Drop).chance(0.5), 60).1, half, "the same seed, the same losses");
 }
 
 #[test]
 fn an_overrun_is_reported_and_counted() {
     let (simulation, bus, mut a, mut b) = pair();
-    bus.plant("b", Fault::new(Kind::Overrun).times(2));
+    bus.plant("b", Fault::new(BusFaultKind::Overrun).times(2));
     for k in 0..3 {
         a.send(Frame::new(1, &[k])).expect("sent");
     }

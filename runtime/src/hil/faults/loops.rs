@@ -8,9 +8,9 @@
 use super::rigs::{Made, PLAIN, Sort};
 use super::run::behaviour;
 use super::space::MS;
-use crate::can::sim::{Fault, Kind as Planting};
+use crate::can::sim::{BusFaultKind as Planting, Fault};
 use crate::drive::fault_injection::{Effect, Hook, Start};
-use crate::drive::simulated_plant::Bench;
+use crate::drive::simulated_plant::SimulatedBench;
 use crate::hil::campaign::quick;
 use crate::hil::cycle::{End, Hil};
 use crate::hil::simulated::{MASTER, Pace, World};
@@ -54,7 +54,7 @@ enum Ill {
 
 /// Parameters of one run.
 #[derive(Clone, Copy, PartialEq, Debug)]
-struct Script {
+struct LoopScript {
     seed: u64,
     rig: Made,
     /// Dead time and lag of the servo, s.
@@ -65,8 +65,8 @@ struct Script {
     after: u64,
 }
 
-impl Script {
-    fn of(seed: u64) -> Script {
+impl LoopScript {
+    fn of(seed: u64) -> LoopScript {
         let mut chance = Chance(seed);
         let sort = if chance.below(2) == 0 { Sort::SpeedServo } else { Sort::PositionServo };
         let ill = match chance.below(8) {
@@ -85,7 +85,7 @@ impl Script {
             ..PLAIN
         };
         let (delay, lag) = (chance.between(0.8e-3, 10e-3), chance.between(0.3e-3, 2e-3));
-        Script { seed, rig, delay, lag, ill, after: (30 + chance.below(700)) * MS }
+        LoopScript { seed, rig, delay, lag, ill, after: (30 + chance.below(700)) * MS }
     }
 
     fn build(&self) -> (Rig, abi::Instance, abi::Instance) {
@@ -117,9 +117,9 @@ impl Stepper {
 ///
 /// # Errors
 /// A violated property.
-fn run(script: &Script) -> Result<Option<u64>, String> {
+fn run(script: &LoopScript) -> Result<Option<u64>, String> {
     let (rig, control, plant) = script.build();
-    let mut bench = Bench::with(&rig, Some(plant), script.seed, |_| behaviour())?.in_steps_of(STEP_NS);
+    let mut bench = SimulatedBench::with(&rig, Some(plant), script.seed, |_| behaviour())?.in_steps_of(STEP_NS);
     if script.ill == Ill::Lost {
         bench.drive(SERVO).unwrap().without_deadlines();
     }
@@ -194,7 +194,7 @@ fn run(script: &Script) -> Result<Option<u64>, String> {
     }
 }
 
-fn plant_fault(script: &Script, world: &World, now_ns: u64) {
+fn plant_fault(script: &LoopScript, world: &World, now_ns: u64) {
     let frame = |kind| world.bus(0).plant(MASTER, Fault::new(kind).id(0x204).from(now_ns));
     let effect = |effect| world.bench().hook(Hook { node: SERVO, effect, start: Start::At(now_ns), lasts_ns: None });
     match (script.ill, script.rig.sort) {
@@ -208,8 +208,8 @@ fn plant_fault(script: &Script, world: &World, now_ns: u64) {
 }
 
 /// Simplifies a failing script while it still fails.
-fn shrunk(script: &Script, why: String) -> (Script, String) {
-    let changes: [fn(&mut Script); 6] = [
+fn shrunk(script: &LoopScript, why: String) -> (LoopScript, String) {
+    let changes: [fn(&mut LoopScript); 6] = [
         |script| script.ill = Ill::Nothing,
         |script| script.rig.eager = false,
         |script| script.rig.swing = 0.8,
@@ -225,7 +225,7 @@ fn an_unexplained_speed_or_position_stops_the_rig_within_a_second() {
     let seeds = seeds(RUNS);
     let runs = seeds.end - seeds.start;
     let (mut stopped, mut longest_ns) = (0, 0);
-    let failed = hold(seeds, Script::of, run, shrunk, |after| {
+    let failed = hold(seeds, LoopScript::of, run, shrunk, |after| {
         stopped += u64::from(after.is_some_and(|after| after > PATIENCE_NS / 2));
         longest_ns = longest_ns.max(after.unwrap_or(0));
     });

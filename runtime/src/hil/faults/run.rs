@@ -8,14 +8,14 @@ use super::invariants::{CLAMPED_NS, Judge, RAMP, STANDSTILL_NS, Violation};
 use super::rigs::TWINS;
 use super::space::{EVER, Fault, Ill, MS, Only, Phase, Script, What};
 use super::wire::{Tap, Traffic};
-use crate::can::sim::{Fault as Planted, Join, Kind as Planting, Port};
+use crate::can::sim::{BusFaultKind as Planting, Fault as Planted, Join, Port};
 use crate::can::{Bus, Frame, Received};
 use crate::canopen::object::Entry;
 use crate::canopen::{Access, NmtState, Object, ObjectDictionary};
 use crate::drive::fault_injection::{Effect, Hook, Start};
 use crate::drive::polarity_check::SignTest;
 use crate::drive::simulated::Behaviour;
-use crate::drive::simulated_plant::Bench;
+use crate::drive::simulated_plant::SimulatedBench;
 use crate::drive::state::Times;
 use crate::drive::{self, Step};
 use crate::hil::control::{self, Control};
@@ -59,7 +59,7 @@ pub struct Passed {
 }
 
 /// A running script.
-struct Run<'a> {
+struct ScriptRun<'a> {
     script: &'a Script,
     rig: Rig,
     made: (abi::Instance, abi::Instance),
@@ -80,7 +80,7 @@ struct Run<'a> {
 
 /// Runs a script; a panic of our own code is a failure like any other.
 pub fn run(script: &Script) -> Result<Passed, Violation> {
-    catch_unwind(AssertUnwindSafe(|| Run::new(script).all())).unwrap_or_else(|panic| {
+    catch_unwind(AssertUnwindSafe(|| ScriptRun::new(script).all())).unwrap_or_else(|panic| {
         let text = panic.downcast_ref::<String>().cloned();
         let text = text.or_else(|| panic.downcast_ref::<&str>().map(|text| (*text).to_string()));
         Err(Violation { broken: Broken::Panic, at_ns: 0, text: text.unwrap_or_default() })
@@ -122,15 +122,15 @@ pub fn behaviour() -> Behaviour {
     Behaviour { boot_ns: 5 * MS, times, ..Behaviour::default() }
 }
 
-impl<'a> Run<'a> {
-    fn new(script: &'a Script) -> Run<'a> {
+impl<'a> ScriptRun<'a> {
+    fn new(script: &'a Script) -> ScriptRun<'a> {
         let (rig, control, plant) = script.rig.build();
-        let bench = Bench::with(&rig, Some(plant.clone()), script.seed, |_| behaviour()).unwrap();
+        let bench = SimulatedBench::with(&rig, Some(plant.clone()), script.seed, |_| behaviour()).unwrap();
         let bench = bench.in_steps_of(STEP_NS);
         let world = World::around(&rig, bench, Pace::Fast, script.seed).unwrap();
         let join = || Join { listen_only: true, ..Join::default() };
         let witnesses = (0..rig.buses.len()).map(|bus| world.bus(bus).join("witness", join())).collect();
-        Run {
+        ScriptRun {
             script,
             witnesses,
             rig,

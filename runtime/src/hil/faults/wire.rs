@@ -107,7 +107,7 @@ pub fn is_foreign(rig: &Rig, bus: usize, frame: &Frame) -> bool {
 
 /// A periodic reading, and the value that the rig accepts for it.
 #[derive(Default)]
-struct Line {
+struct PeriodicReading {
     /// Last received value, SI.
     told: f64,
     /// It arrived in this cycle, in answer to SYNC.
@@ -124,7 +124,7 @@ struct Line {
     odd: u32,
 }
 
-impl Line {
+impl PeriodicReading {
     fn tell(&mut self, value: f64, fresh: bool) {
         self.told = value;
         self.fresh |= fresh;
@@ -192,8 +192,8 @@ pub struct CycleInputs {
     word: u16,
     /// The reported mode of operation, if the drive has reported a change after arming.
     shown: Option<i8>,
-    speed: Line,
-    position: Line,
+    speed: PeriodicReading,
+    position: PeriodicReading,
     /// Last received counts, the accumulated counts, and their origin, rad.
     counts: Option<i32>,
     turned: i64,
@@ -219,8 +219,8 @@ impl CycleInputs {
                 mode: 0,
                 word: 0,
                 shown: None,
-                speed: Line { reach: f64::INFINITY, ..Line::default() },
-                position: Line::default(),
+                speed: PeriodicReading { reach: f64::INFINITY, ..PeriodicReading::default() },
+                position: PeriodicReading::default(),
                 counts: None,
                 turned: 0,
                 base: 0.0,
