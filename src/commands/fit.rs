@@ -9,7 +9,7 @@ mod text;
 use super::{End, load, reported, sound, sweep};
 use crate::args;
 use crate::commands::fit::answer::Fitted;
-use crate::compile::{self, Alone, Asks, Changes, HELD, Loaded, Options, Stopwatch};
+use crate::compile::{self, Asks, Changes, ElementaryFunction, HELD, Loaded, Options, Stopwatch};
 use crate::figure::{self, Recorded};
 use crate::plot::{self, Kind, Look};
 use crate::project;
@@ -140,8 +140,8 @@ fn one(args: &args::Fit, loaded: &mut Loaded, name: &str, options: &Options, ter
         }
         let place = text::Place { folder: &args.out, file: &args.file, data: &recording.0, hash: &recording.1 };
         // A text on the standard input has no place from which another could import it.
-        let text = (args.file != Path::new(project::STANDARD))
-            .then(|| text::text(loaded, statement, &fitted, &runs.fit.asks, &place));
+        let text =
+            (!project::is_standard(&args.file)).then(|| text::text(loaded, statement, &fitted, &runs.fit.asks, &place));
         match written(args, (name, text), &runs, &fitted, &outcome, &recording) {
             Ok(paths) if !args.quiet => {
                 let paths: Vec<String> = paths.iter().map(|path| path.display().to_string()).collect();
@@ -338,7 +338,7 @@ fn cause(failure: &Failure) -> String {
 /// Searches with the step of the text, and again with half of it until that changes nothing that matters. Returns the
 /// answer, the step, and what is to be said of it.
 fn search(runs: &Runs, level: f64) -> Result<(Answer, f64, Option<String>), Trouble> {
-    let (exp, log) = (Alone::exp(), Alone::log());
+    let (exp, log) = (ElementaryFunction::exp(), ElementaryFunction::log());
     let with = Elementary { exp: &|x| exp.at(x), log: &|x| log.at(x) };
     let asks = &runs.fit.asks;
     let mut unknowns: Vec<Unknown> = asks
