@@ -241,7 +241,7 @@ impl Runs {
                 experiment.corners.dedup();
             }
             Method::Adaptive => {}
-            Method::Euler | Method::Rk4 | Method::Expo | Method::Implicit => experiment.solver.step = step,
+            _ => experiment.solver.step = step,
         }
         Ok((made.instance, experiment))
     }

@@ -174,8 +174,6 @@ fn as_text(solver: &Solver) -> String {
     let plain = abi::format::plain;
     match solver.method {
         Method::Adaptive => format!("adaptive tol {}", plain(solver.tol)),
-        Method::Euler | Method::Rk4 | Method::Expo | Method::Implicit => {
-            format!("{} step {} s", solver.method.name(), plain(solver.step))
-        }
+        method => format!("{} step {} s", method.name(), plain(solver.step)),
     }
 }
