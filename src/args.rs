@@ -92,6 +92,8 @@ pub enum Command {
     Repl(Repl),
     /// Rerun an experiment at each save, with its states carried over
     Watch(Watch),
+    /// See a simulation change under the hand, or look through a recording, in a browser
+    Panel(Panel),
     /// Show everything in a package, and verify it
     Inspect(Inspect),
     /// Create keys to sign packages with
@@ -122,8 +124,8 @@ pub enum Command {
         /// Such as run
         #[arg(value_parser = [
             "run", "test", "sweep", "fit", "linearise", "bench", "build", "hil", "replay", "check", "fmt", "explain",
-            "characterise", "compare", "doc", "repl", "watch", "inspect", "key", "deploy", "fetch-log", "drives", "bus",
-            "doctor", "predict", "bench-rt", "new", "completions",
+            "characterise", "compare", "doc", "repl", "watch", "panel", "inspect", "key", "deploy", "fetch-log", "drives",
+            "bus", "doctor", "predict", "bench-rt", "new", "completions",
         ])]
         command: Option<String>,
     },
@@ -900,6 +902,34 @@ pub struct Watch {
     /// Run from the start each time
     #[arg(long)]
     pub restart: bool,
+}
+
+/// `fric panel`
+#[derive(clap::Args, Debug)]
+pub struct Panel {
+    /// A text with experiments, or a log of `fric hil`
+    #[arg(value_hint = ValueHint::FilePath)]
+    pub file: PathBuf,
+    /// Experiments of the text to offer; all if none is named
+    pub experiments: Vec<String>,
+    /// What of the experiment is changed
+    #[command(flatten)]
+    pub changed: Changed,
+    /// Port on this computer; if it is taken, the next free one
+    #[arg(long, value_name = "PORT", default_value_t = panel::server::PORT)]
+    pub port: u16,
+    /// Curves of a recording in memory; what is older is left out
+    #[arg(long, value_name = "SIZE", value_parser = runtime::record::parts::bytes, default_value = "256MB")]
+    pub keep: u64,
+    /// Print the link, and open no browser
+    #[arg(long)]
+    pub no_open: bool,
+    /// Write what the page would show into one HTML file that needs nothing else, and serve nothing
+    #[arg(long, value_name = "FILE.html", value_hint = ValueHint::FilePath)]
+    pub save: Option<PathBuf>,
+    /// Interpret instead of making machine code: slow, for comparison
+    #[arg(long)]
+    pub interpret: bool,
 }
 
 /// `fric inspect`

@@ -26,8 +26,9 @@ pub use compiler::frontend::system::LINTS;
 use compiler::opt::reassociate;
 pub use compiler::rig::{StepDerivative, bus_load, dbc_messages, linear as linear_of};
 pub use compiler::{
-    Built, Case, Changes, CompiledRig, Loaded, Options, SourceFile, Sources, build, check, check_declarations, compile,
-    dissipation, explain, explain_in, explain_rig, explain_run, fit, linear, load, quantities, rig, stepping, varying,
+    Built, Case, Changes, CompiledRig, Loaded, Options, SourceFile, Sources, adjustable, build, check,
+    check_declarations, compile, dissipation, explain, explain_in, explain_rig, explain_run, fit, linear, load,
+    quantities, rig, stepping, varying,
 };
 use grammar::diagnostic::Diagnostic;
 use std::time::Instant;

@@ -30,6 +30,7 @@ mod signing;
 mod source_snapshot;
 mod ssh;
 mod unfinished;
+mod shown;
 mod commands;
 
 use commands::End;

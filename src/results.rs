@@ -289,7 +289,7 @@ fn window(text: &str) -> &str {
 }
 
 /// The value with its error, the distance to the limit, and the time.
-fn words(verdict: &Verdict, estimate: Option<&Estimate>, digits: Option<u8>) -> String {
+pub fn words(verdict: &Verdict, estimate: Option<&Estimate>, digits: Option<u8>) -> String {
     if let Some(problem) = &verdict.problem {
         return problem.clone();
     }

@@ -93,11 +93,12 @@ fn files(folders: &[&str], ending: &str) -> Vec<PathBuf> {
 }
 
 /// Folders of sources, with the name of their crate.
-const SOURCES: [(&str, &str); 6] = [
+const SOURCES: [(&str, &str); 7] = [
     ("grammar", "grammar/src"),
     ("abi", "abi/src"),
     ("compiler", "compiler/src"),
     ("runtime", "runtime/src"),
+    ("panel", "panel/src"),
     ("fric-rig", "rig/src"),
     ("fric", "src"),
 ];
@@ -180,8 +181,9 @@ fn commits() -> Outcome {
 }
 
 /// Every folder with Rust code.
-const ALL: [&str; 11] =
-    ["grammar", "abi", "compiler", "runtime", "rig", "src", "tests", "benches", "fuzz", "examples", "build.rs"];
+const ALL: [&str; 12] = [
+    "grammar", "abi", "compiler", "runtime", "panel", "rig", "src", "tests", "benches", "fuzz", "examples", "build.rs",
+];
 
 /// Functions with an attribute, by file.
 struct Tests<'f> {

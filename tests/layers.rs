@@ -14,13 +14,14 @@ fn root() -> PathBuf {
 }
 
 /// Our crates with their sources, and those of our crates that each may use.
-const CRATES: [(&str, &str, &[&str]); 6] = [
+const CRATES: [(&str, &str, &[&str]); 7] = [
     ("grammar", "grammar/src/lib.rs", &[]),
     ("abi", "abi/src/lib.rs", &[]),
     ("compiler", "compiler/src/lib.rs", &["grammar", "abi"]),
     ("runtime", "runtime/src/lib.rs", &["abi"]),
+    ("panel", "panel/src/lib.rs", &[]),
     ("fric-rig", "rig/src/main.rs", &["abi", "runtime"]),
-    ("fric", "src/main.rs", &["grammar", "abi", "compiler", "runtime"]),
+    ("fric", "src/main.rs", &["grammar", "abi", "compiler", "runtime", "panel"]),
 ];
 
 /// Where an outside crate may be named: files or folders. A crate used throughout one of ours has the source folder of
@@ -41,6 +42,8 @@ const HOMES: &[(&str, &[&str])] = &[
     ("csv", &["src/", "runtime/src/record/csv.rs"]),
     ("ct-codecs", &["src/signing.rs"]),
     ("ctrlc", &["src/interrupt.rs"]),
+    ("getrandom", &["panel/src/key.rs"]),
+    ("httparse", &["panel/src/http.rs"]),
     ("indicatif", &["src/commands/shared/progress.rs"]),
     // The kernel's calls: descriptors and sockets, clocks and threads, signals.
     ("libc", &["runtime/src/can/", "runtime/src/realtime/", "runtime/src/hil/emergency.rs"]),
@@ -60,15 +63,17 @@ const HOMES: &[(&str, &[&str])] = &[
     ("rustix", &["runtime/src/record/parts.rs"]),
     ("rustyline", &["src/repl/line.rs"]),
     ("rustc-hash", &["compiler/src/hash.rs"]),
-    // JSON is a form of every command's results.
-    ("serde_json", &["src/"]),
+    // JSON is a form of every command's results, and what the page of a panel reads.
+    ("serde_json", &["src/", "panel/src/"]),
     ("sha2", &["abi/src/image.rs"]),
     ("socketcan", &["runtime/src/can/socketcan.rs"]),
     ("stacker", &["grammar/src/parse.rs"]),
     ("strsim", &["compiler/src/frontend/names.rs"]),
     ("subsetter", &["src/plot/pdf.rs"]),
-    ("tempfile", &["src/commands/deploy.rs"]),
+    ("tempfile", &["src/commands/deploy.rs", "src/commands/panel.rs"]),
     ("terminal_size", &["src/terminal.rs"]),
+    // A socket begins as a request.
+    ("tungstenite", &["panel/src/http.rs", "panel/src/viewer.rs"]),
 ];
 
 type Module = Vec<String>;

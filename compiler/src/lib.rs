@@ -100,7 +100,11 @@ pub fn varying(
     if let Some(error) = variants.iter().find_map(|variant| experiment::vary::built_in(variant, &varied(variant))) {
         return Err(vec![error]);
     }
-    Ok(variants.into_iter().map(|variant| varied_code(loaded, variant, options)).collect())
+    let one = |variant: experiment::Variant| {
+        let paths = varied(&variant);
+        runs(variant, &paths, &loaded.files, options.interpret)
+    };
+    Ok(variants.into_iter().map(one).collect())
 }
 
 /// Compiles a fit: its experiment for many runs that differ in the values of its unknowns.
@@ -117,31 +121,60 @@ pub fn fit(
     if let Some(error) = experiment::vary::built_in(&variant, &paths) {
         return Err(vec![error]);
     }
-    let mut options = options.clone();
-    options.changes.vary = paths;
-    Ok(fit::Fit { varying: varied_code(loaded, variant, &options), asks })
+    let paths = experiment::start_values::params(&variant.system, &paths);
+    Ok(fit::Fit { varying: runs(variant, &paths, &loaded.files, options.interpret), asks })
 }
 
-/// Code for runs of an experiment that differ in the values of the parameters in `options.changes.vary`.
-fn varied_code(loaded: &Loaded, variant: experiment::Variant, options: &Options) -> experiment::vary::Varying {
-    let paths = &experiment::start_values::params(&variant.system, &options.changes.vary);
+/// Compiles an experiment once for runs that differ in any of its parameters, as [`varying`] does for those that are
+/// named. Parameters that determine what is compiled, such as a number of parts, keep their values: they are not among
+/// [`experiment::vary::Varying::params`].
+///
+/// # Errors All errors of the experiment and of the models it runs; an experiment that runs a rig (E0905).
+pub fn adjustable(
+    loaded: &mut Loaded,
+    sources: &dyn Sources,
+    experiment: &str,
+    options: &Options,
+    warnings: &mut Vec<Diagnostic>,
+) -> Result<Vec<experiment::vary::Varying>, Vec<Diagnostic>> {
+    let variants = read(loaded, sources, experiment, &options.changes, warnings, &mut |_| ())?;
+    if let Some(variant) = variants.iter().find(|variant| variant.rig.is_some()) {
+        // The plant of a rig is a program of its own. Parameters that are named are refused with place and remedy.
+        let vary =
+            variant.program.description.quantities.iter().map(|quantity| quantity.path.clone()).take(1).collect();
+        let changes = Changes { vary, ..options.changes.clone() };
+        let refused = read(loaded, sources, experiment, &changes, warnings, &mut |_| ());
+        return Err(refused.err().unwrap_or_default());
+    }
+    let one = |variant: experiment::Variant| {
+        let description = &variant.program.description;
+        let params = description.quantities.iter().filter(|q| description.layout.params.contains(q.slot));
+        let mut paths: Vec<String> = params.map(|quantity| quantity.path.clone()).collect();
+        paths.retain(|path| experiment::vary::built_in(&variant, std::slice::from_ref(path)).is_none());
+        runs(variant, &paths, &loaded.files, options.interpret)
+    };
+    Ok(variants.into_iter().map(one).collect())
+}
+
+/// An experiment with its code, for runs that differ in the parameters `paths`.
+fn runs(
+    variant: experiment::Variant,
+    paths: &[String],
+    files: &frontend::source::Files,
+    interpret: bool,
+) -> experiment::vary::Varying {
     // The description keeps its ranges. The code of a fixed step drops the guards of those that the runs change.
     let mut coded = variant.program.clone();
     coded.description.guards = experiment::vary::in_code(&variant, paths);
     let functions = functions(&coded, variant.experiment.solver.method);
-    let (code, notes) = code(&functions, &coded.description, options.interpret);
-    let alone = options.interpret || variant.experiment.bench.is_some();
+    let (code, notes) = code(&functions, &coded.description, interpret);
+    let alone = interpret || variant.experiment.bench.is_some();
     let lanes = if alone { None } else { codegen::tiering::lanes(&coded, variant.experiment.solver.method) };
     let adaptive = variant.adaptive.as_ref().map(|program| {
-        let code = codegen::tiering::on_demand(program, Method::Adaptive, options.interpret);
+        let code = codegen::tiering::on_demand(program, Method::Adaptive, interpret);
         Arc::new(Instance::new(Arc::new(program.description.clone()), code, &program.params))
     });
-    experiment::vary::Varying::new(
-        variant,
-        paths,
-        &loaded.files,
-        experiment::vary::Runnable { code, lanes, adaptive, notes },
-    )
+    experiment::vary::Varying::new(variant, paths, files, experiment::vary::Runnable { code, lanes, adaptive, notes })
 }
 
 /// A model or an experiment as one program, for uses other than a run (C, images, listings).

@@ -19,6 +19,7 @@ mod inspect;
 mod key;
 mod linearise;
 mod new;
+mod panel;
 mod predict;
 mod watch;
 mod repl;
@@ -93,6 +94,7 @@ pub fn run(args: &Args, begin: Instant, terminal: &mut Terminal) -> End {
         Command::Drives(args) => drives::drives(args, terminal),
         Command::Repl(args) => repl::repl(args, terminal),
         Command::Watch(args) => watch::watch(args, terminal),
+        Command::Panel(args) => panel::panel(args, terminal),
         Command::Inspect(args) => inspect::inspect(args, terminal),
         Command::Key { command: Key::New(args) } => key::new(args, terminal),
         Command::Deploy(args) => deploy::deploy(args, terminal),

@@ -1,20 +1,17 @@
 //! `fric replay`: recomputes a rig's log, and exports it.
 
-use super::{End, load_text};
+use super::End;
 use crate::args::Replay as Args;
-use crate::compile::{self, Changes, Options, Stopwatch};
+use crate::commands::shared::rig_log::{self, Opened};
 use crate::parquet::{self, Holds};
-use crate::source_snapshot::Kept;
 use crate::terminal::Terminal;
-use crate::{project, quantity, report};
+use crate::{project, quantity};
 use abi::rig::Rig;
 use runtime::hil::control::Control;
-use runtime::hil::cycle::look_ahead;
 use runtime::hil::replay::{Replay, Stopped, What};
 use runtime::hil::trace::{self, Cycle, Passed, Shape};
 use runtime::hil::words;
-use runtime::record::blocks::End as LogEnd;
-use runtime::record::log::{Message, Reader};
+use runtime::record::log::Message;
 use std::fmt::Write;
 use std::path::Path;
 
@@ -24,36 +21,11 @@ pub fn replay(args: &Args, terminal: &mut Terminal) -> End {
         terminal.error(&format!("{name}: {why}"));
         End::Failed
     };
-    let mut reader = match Reader::open(&args.log) {
-        Ok(reader) => reader,
+    let Opened { mut reader, ready, control } = match rig_log::open(&args.log, args.interpret, terminal) {
+        Ok(opened) => opened,
         Err(why) => return fail(terminal, &why),
     };
-    let head = reader.head.clone();
-    let needed = ["rig", "file", "source", "set"].map(|section| head.text(section));
-    let [Some(rig), Some(file), Some(source), Some(set)] = needed else {
-        return fail(terminal, "its head lacks the text of the rig");
-    };
-    let Some((bounds, settings)) = head.get("settings").and_then(trace::settings_from_bytes) else {
-        return fail(terminal, "its head lacks what the drives said of themselves");
-    };
-    let kept = Kept(&head);
-    let mut watch = Stopwatch::start("read");
-    let Some(mut loaded) = load_text(file, source, &kept, terminal, &mut watch) else { return End::Failed };
-    let changes = Changes { set: set.lines().map(str::to_string).collect(), ..Changes::default() };
-    let options = Options { changes, interpret: args.interpret };
-    let ready = match compile::rig(&mut loaded, &kept, rig, &options, &mut Vec::new()) {
-        Ok(ready) => ready,
-        Err(found) => {
-            terminal.report(&report::full(&loaded.files.0, &found, terminal.error_colour()));
-            return fail(terminal, "the rig in it does not compile");
-        }
-    };
-    let made = look_ahead(&ready.rig, &ready.plant)
-        .and_then(|look| Control::new(&ready.rig, ready.control, look, &bounds, settings));
-    let control = match made {
-        Ok(control) => control,
-        Err(why) => return fail(terminal, &why),
-    };
+    let rig = &ready.rig.name;
     let mut exports = Exports::new(args, &ready.rig, &control);
     let mut replay = Replay::new(&ready.rig, control);
     let mut stopped = None;
@@ -73,13 +45,9 @@ pub fn replay(args: &Args, terminal: &mut Terminal) -> End {
     }
     // A log may continue in further files; the end to report is that of the last file read.
     let last = if reader.path() == args.log { "it".into() } else { reader.path().display().to_string() };
-    let ends = match reader.end() {
-        Some(LogEnd::Cut { at }) => format!("{last} is cut off at byte {at}: the writer was killed"),
-        Some(LogEnd::Damaged { at }) => return fail(terminal, &format!("{last} is damaged at byte {at}")),
-        Some(LogEnd::Whole) | None => match reader.tail().and_then(|tail| tail.text("end")) {
-            Some(end) => format!("it ended {end}"),
-            None => "it was not ended: the writer was killed".into(),
-        },
+    let ends = match rig_log::ending(&reader, &last) {
+        Ok(ends) => ends,
+        Err(why) => return fail(terminal, &why),
     };
     let found = replay.found();
     match stopped {

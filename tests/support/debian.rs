@@ -8,7 +8,18 @@ use std::sync::{Mutex, PoisonError};
 
 /// The folder of unpacked packages, from an earlier run or fetched now. `name`: of the folder. `wanted`: what cannot be
 /// tested without them, for the message.
+#[allow(dead_code, reason = "not every test that shares this file")]
 pub fn unpacked(name: &str, packages: &[&str], wanted: &str) -> PathBuf {
+    fetched(name, packages, false, wanted)
+}
+
+/// The same of a package with those that it needs and this system lacks.
+#[allow(dead_code, reason = "not every test that shares this file")]
+pub fn unpacked_with_dependencies(name: &str, package: &str, wanted: &str) -> PathBuf {
+    fetched(name, &[package], true, wanted)
+}
+
+fn fetched(name: &str, packages: &[&str], dependencies: bool, wanted: &str) -> PathBuf {
     // Tests of one binary run in parallel.
     static ONE: Mutex<()> = Mutex::new(());
     let _one = ONE.lock().unwrap_or_else(PoisonError::into_inner);
@@ -19,25 +30,41 @@ pub fn unpacked(name: &str, packages: &[&str], wanted: &str) -> PathBuf {
     // Under a temporary name until it is complete.
     let begun = folder.with_extension(format!("begun-{}", std::process::id()));
     let archives = begun.join("archives");
-    fs::create_dir_all(archives.join("partial")).expect("target/ can be written");
-    let fetch = |own_lists: bool, what: &[&str]| {
+    for folder in ["archives", "lists", "cache/archives"] {
+        fs::create_dir_all(begun.join(folder).join("partial")).expect("target/ can be written");
+    }
+    // The output of apt-get, if it succeeds.
+    let apt = |own_lists: bool, what: &[&str], packages: &[&str]| {
         let mut command = Command::new("apt-get");
         command.current_dir(&archives).args(["-q", "-o", "APT::Sandbox::User=root"]);
         if own_lists {
             command.arg("-o").arg(format!("Dir::State::Lists={}", begun.join("lists").display()));
             command.arg("-o").arg(format!("Dir::Cache={}", begun.join("cache").display()));
         }
-        command.args(what).output().is_ok_and(|output| output.status.success())
+        let output = command.args(what).args(packages).output().ok().filter(|output| output.status.success())?;
+        Some(String::from_utf8_lossy(&output.stdout).into_owned())
     };
-    let download: Vec<&str> = ["download"].into_iter().chain(packages.iter().copied()).collect();
-    let fetched = fetch(false, &download) || fetch(true, &["update"]) && fetch(true, &download);
+    let fetch = |own_lists: bool| {
+        let needed = match dependencies {
+            true => apt(own_lists, &["-s", "--no-install-recommends", "install"], packages)?,
+            false => String::new(),
+        };
+        let needed = needed.lines().filter_map(|line| line.strip_prefix("Inst ")?.split(' ').next());
+        let mut all: Vec<&str> = packages.iter().copied().chain(needed).collect();
+        all.sort_unstable();
+        all.dedup();
+        apt(own_lists, &["download"], &all)
+    };
+    let fetched = fetch(false).or_else(|| apt(true, &["update"], &[]).and_then(|_| fetch(true))).is_some();
     assert!(fetched, "{wanted}, and apt-get cannot download {}", packages.join(" "));
     for archive in fs::read_dir(&archives).expect("it was just made").flatten() {
         if archive.path().extension().is_some_and(|extension| extension == "deb") {
             done(Command::new("dpkg-deb").arg("-x").arg(archive.path()).arg(&begun), "dpkg-deb");
         }
     }
-    fs::remove_dir_all(&archives).expect("target/ can be written");
+    for folder in ["archives", "lists", "cache"] {
+        fs::remove_dir_all(begun.join(folder)).expect("target/ can be written");
+    }
     // Another test may have been faster: its result is the same.
     if fs::rename(&begun, &folder).is_err() {
         fs::remove_dir_all(&begun).expect("target/ can be written");

@@ -37,6 +37,7 @@ pub struct Varying {
     code: Code,
     lanes: Option<Lanes>,
     adaptive: Option<Arc<Instance>>,
+    varied: Vec<String>,
     formulas: Func,
     size: usize,
     /// Uses of the values of the formulas, in order.
@@ -167,6 +168,7 @@ impl Varying {
             code,
             lanes,
             adaptive,
+            varied: vary.to_vec(),
             formulas,
             size,
             uses,
@@ -192,6 +194,17 @@ impl Varying {
     /// The parameter of this path, or the one for the start value of the state of this path, if a run can set it.
     pub fn param(&self, path: &str) -> Option<&Quantity> {
         param_of(&self.description, path)
+    }
+
+    /// The parameters that may vary, in the order of the text, each with its value in SI as the text has it.
+    pub fn params(&self) -> impl Iterator<Item = (&Quantity, f64)> {
+        let params = self.description.layout.params;
+        let varied = self
+            .description
+            .quantities
+            .iter()
+            .filter(move |quantity| params.contains(quantity.slot) && self.varied.contains(&quantity.path));
+        varied.map(move |quantity| (quantity, self.params[quantity.slot.index() - params.start as usize]))
     }
 
     /// Number of the experiment's expectations. Later verdicts concern ranges; see [`Varying::left`].

@@ -4,5 +4,6 @@
 pub mod cross_check;
 pub mod package;
 pub mod progress;
+pub mod rig_log;
 pub mod session;
 pub mod open;

@@ -1,0 +1,59 @@
+// All words of the page.
+
+/** @param {number} x @param {number} digits */
+export function number(x, digits) {
+  if (!Number.isFinite(x)) return x > 0 ? '∞' : x < 0 ? '−∞' : '–';
+  const size = Math.abs(x);
+  const text = size !== 0 && (size < 1e-3 || size >= 1e6) ? x.toExponential(digits - 1) : String(Number(x.toPrecision(digits)));
+  return text.replaceAll('-', '−');
+}
+
+export const words = {
+  curves: 'Curves',
+  parameters: 'Parameters',
+  side: 'Parameters and results',
+  undo: 'undo',
+  asText: 'as the text',
+  keep: (/** @type {string} */ letter) => `keep ${letter}`,
+  go: (/** @type {string} */ letter) => `to ${letter}`,
+  drawn: ['as the text', '', 'A', 'B'],
+  set: 'These values for `fric run`, `fric sweep`, `fric hil`',
+  none: 'nothing is changed',
+  copy: 'copy',
+  copied: 'copied',
+  expected: 'Expected',
+  late: 'How late cycles began, µs',
+  lateWords: (/** @type {any} */ late) => `p50 below ${number(late.p50, 2)} µs, p99 below ${number(late.p99, 2)} µs, at most ${number(late.max, 3)} µs, ${late.missed} missed`,
+  events: 'What happened',
+  nothing: 'nothing but cycles',
+  table: 'Values',
+  whole: 'all',
+  closer: 'closer',
+  wider: 'wider',
+  values: 'values',
+  cursors: 'cursors',
+  cursor: (/** @type {number} */ i) => `cursor ${i}`,
+  between: (/** @type {number} */ from, /** @type {number} */ to) => `${number(from, 5)} s to ${number(to, 5)} s: Δt ${number(to - from, 5)} s, 1/Δt ${number(1 / (to - from), 4)} Hz`,
+  measures: ['difference', 'min', 'max', 'peak to peak'],
+  keys: 'Keys: + and − zoom, ← and → move, Home shows all, t shows values, c cursors, u undoes. The wheel zooms about the pointer, dragging moves.',
+  experiments: 'Experiments',
+  tools: 'Window of time',
+  running: (/** @type {any} */ hello, /** @type {any} */ run) => {
+    const judged = run.verdicts.filter((/** @type {any} */ v) => !v.shown), held = judged.filter((/** @type {any} */ v) => v.holds).length;
+    const first = judged.length === 0 ? '' : held === judged.length ? 'as expected; ' : `${judged.length - held} of ${judged.length} not as expected; `;
+    return `${first}${hello.solver}, ${run.words}`;
+  },
+  failed: (/** @type {string[]} */ failures) => failures.join('; '),
+  lost: 'not connected: the panel has ended, or is being started again',
+  wrongKey: 'this link is from an earlier start: open the one that is printed now',
+  saved: 'a saved report',
+  recording: (/** @type {any} */ state) => `recording: ${state.words}`,
+  refused: (/** @type {string} */ why) => why,
+  summary: (/** @type {string} */ name, /** @type {string} */ unit, /** @type {number[]} */ [from, to, low, high, end]) =>
+    low > high ? `${name}, ${number(from, 4)} s to ${number(to, 4)} s, no values`
+      : `${name}, ${number(from, 4)} s to ${number(to, 4)} s, ${`${number(low, 4)} to ${number(high, 4)} ${unit}`.trim()}, at the end ${number(end, 4)}`,
+  plane: (/** @type {string} */ y, /** @type {string} */ x) => `${y} over ${x}`,
+  time: 't in s',
+  slider: (/** @type {string} */ name) => `${name}, slider`,
+  at: (/** @type {number} */ t) => `at ${number(t, 6)} s`,
+};

@@ -1,0 +1,30 @@
+//! What a panel shows and obeys: the one trait between the server and a simulation, a recording, or a rig.
+
+use crate::frame::Frame;
+use crate::line::View;
+use serde_json::Value;
+
+/// Something that a panel shows. All methods are called from several threads, and none may wait for long.
+pub trait Subject: Send + Sync {
+    /// What does not change while it is shown: its name, signals, plots, parameters; and its number, which changes when
+    /// this does. Every viewer gets it again then.
+    fn hello(&self) -> (u64, Value);
+
+    /// What changes now and then, such as the values of parameters and verdicts, and its number.
+    fn state(&self) -> (u64, Value);
+
+    /// A number that grows whenever any curve changes.
+    fn version(&self) -> u64;
+
+    /// The end of the data, s.
+    fn newest(&self) -> f64;
+
+    /// Appends the curves of a view that have changed after version `since`; all of them if none.
+    fn blocks(&self, view: &View, since: Option<u64>, frame: &mut Frame);
+
+    /// Obeys the words of a page.
+    ///
+    /// # Errors
+    /// Why not.
+    fn say(&self, words: &str) -> Result<String, String>;
+}

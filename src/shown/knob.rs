@@ -1,0 +1,194 @@
+//! A parameter as a slider: its ends, its scale, and values as typed.
+
+use crate::quantity;
+use abi::description::{Quantity, TINY};
+use abi::format;
+use abi::unit::Unit;
+use panel::words::clean;
+use serde_json::{Value, json};
+
+/// A parameter that can be set.
+#[derive(Clone, PartialEq, Debug)]
+pub struct Knob {
+    /// Dotted path.
+    pub path: String,
+    /// The unit in which it is shown.
+    pub unit: Unit,
+    doc: Option<String>,
+    boolean: bool,
+    range: (f64, f64),
+    /// The value of the text, SI.
+    pub own: f64,
+}
+
+/// The ends of a slider, SI.
+#[derive(Clone, Copy, PartialEq, Debug)]
+struct Ends {
+    from: f64,
+    to: f64,
+    /// Whether equal distances are equal ratios.
+    logarithmic: bool,
+}
+
+/// The ends of a slider: the declared range if it is finite; if only its upper end is open, a tenth to ten times a
+/// positive value; otherwise plus and minus twice the value. Never outside the declared range.
+fn ends(value: f64, (low, high): (f64, f64)) -> Ends {
+    if low.is_finite() && high.is_finite() {
+        // A range such as `> 0` begins at the smallest number that it allows, which is no end for a slider.
+        let low = if low == TINY { 0.0 } else { low };
+        return Ends { from: low, to: high, logarithmic: low > 0.0 && high >= 100.0 * low };
+    }
+    if low >= 0.0 && value > 0.0 {
+        return Ends { from: (0.1 * value).max(low), to: 10.0 * value, logarithmic: true };
+    }
+    // Without an end of its own the page shows no slider.
+    let size = if value == 0.0 || !value.is_finite() { 1.0 } else { 2.0 * value.abs() };
+    Ends { from: (-size).max(low), to: size.min(high), logarithmic: false }
+}
+
+impl Knob {
+    /// Of a parameter with its value in the text.
+    pub fn new(quantity: &Quantity, own: f64) -> Knob {
+        let Quantity { path, unit, doc, boolean, range, .. } = quantity;
+        Knob { path: path.clone(), unit: unit.clone(), doc: doc.clone(), boolean: *boolean, range: *range, own }
+    }
+
+    /// What the page needs to know of it; numbers in its unit.
+    pub fn json(&self) -> Value {
+        let Ends { from, to, logarithmic } = ends(self.own, self.range);
+        json!({
+            "path": self.path,
+            "unit": self.unit.text,
+            "doc": self.doc.as_deref().map(|doc| clean(doc.lines().next().unwrap_or_default().trim())),
+            "boolean": self.boolean,
+            "from": self.unit.from_si(from),
+            "to": self.unit.from_si(to),
+            "logarithmic": logarithmic,
+            "own": self.unit.from_si(self.own),
+        })
+    }
+
+    /// A value in SI as it is typed: `0.42 N·m`.
+    pub fn text(&self, si: f64) -> String {
+        match si {
+            si if self.boolean => (si != 0.0).to_string(),
+            f64::INFINITY => "inf".into(),
+            f64::NEG_INFINITY => "-inf".into(),
+            si => format::quantity(si, &self.unit, 9),
+        }
+    }
+
+    /// A typed value in SI.
+    ///
+    /// # Errors
+    /// What is wrong with it.
+    pub fn value(&self, text: &str) -> Result<f64, String> {
+        if self.boolean {
+            return match text {
+                "true" => Ok(1.0),
+                "false" => Ok(0.0),
+                _ => Err(format!("`{}` is true or false, not `{}`", self.path, clean(text))),
+            };
+        }
+        // A value without end has no unit; only where the text has one.
+        if text == "inf" && self.own == f64::INFINITY || text == "-inf" && self.own == f64::NEG_INFINITY {
+            return Ok(self.own);
+        }
+        let (si, unit) = quantity::parse(text).map_err(|why| clean(&why))?;
+        if unit.dimension == self.unit.dimension || si == 0.0 && unit.text.is_empty() {
+            return Ok(si);
+        }
+        let (wanted, found) = (self.unit.dimension.describe(), unit.dimension.describe());
+        Err(format!("`{}` is {wanted}, not {found}: type it as in {}", self.path, self.text(self.own)))
+    }
+}
+
+/// Reads `PATH = VALUE, …`: the numbers of the knobs and their values in SI.
+///
+/// # Errors
+/// What is wrong with it; then nothing is set.
+pub fn set(text: &str, knobs: &[Knob]) -> Result<Vec<(usize, f64)>, String> {
+    let one = |text: &str| {
+        let Some((path, value)) = text.split_once('=') else {
+            return Err(format!("`{}` sets nothing: write it as PATH = VALUE", clean(text.trim())));
+        };
+        let path = path.trim();
+        let Some(at) = knobs.iter().position(|knob| knob.path == path) else {
+            let near = crate::compile::nearest(path, knobs.iter().map(|knob| knob.path.as_str()));
+            let help = near.map_or(String::new(), |near| format!("; did you mean `{near}`?"));
+            return Err(format!("there is no parameter `{}` to set{help}", clean(path)));
+        };
+        Ok((at, knobs[at].value(value.trim())?))
+    };
+    text.split(',').map(one).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use abi::Slot;
+    use abi::description::Kind;
+
+    fn knob(path: &str, unit: &str, own: f64, range: (f64, f64)) -> Knob {
+        let unit = if unit.is_empty() { Unit::none() } else { Unit::parse(unit).unwrap() };
+        let kind = Kind::Param;
+        let quantity =
+            Quantity { path: path.into(), kind, unit, boolean: path == "on", slot: Slot(3), range, doc: None };
+        Knob::new(&quantity, own)
+    }
+
+    #[test]
+    fn ends_hold_the_value_and_stay_inside_the_range() {
+        const INF: f64 = f64::INFINITY;
+        let of = |value, range| {
+            let Ends { from, to, logarithmic } = ends(value, range);
+            assert!(from <= value && value <= to && from < to, "{value} in {range:?}: {from} .. {to}");
+            assert!(from >= range.0 || range.0 == TINY, "{from}");
+            assert!(to <= range.1 && from.is_finite() && to.is_finite());
+            (from, to, logarithmic)
+        };
+        assert_eq!(of(0.5, (0.0, 1.0)), (0.0, 1.0, false));
+        assert_eq!(of(0.5, (TINY, 1.0)), (0.0, 1.0, false));
+        assert_eq!(of(5.0, (0.01, 10.0)), (0.01, 10.0, true));
+        assert_eq!(of(2.0, (TINY, INF)), (0.2, 20.0, true));
+        assert_eq!(of(2.0, (1.0, INF)), (1.0, 20.0, true));
+        assert_eq!(of(0.0, (0.0, INF)), (0.0, 1.0, false));
+        assert_eq!(of(-3.0, (-INF, INF)), (-6.0, 6.0, false));
+        assert_eq!(of(-3.0, (-INF, -1.0)), (-6.0, -1.0, false));
+        assert_eq!(of(0.0, (-INF, INF)), (-1.0, 1.0, false));
+    }
+
+    #[test]
+    fn values_are_read_in_any_unit_that_fits() {
+        let all =
+            [knob("fr.Fs", "N·m", 0.42, (0.0, 1.0)), knob("Ti", "s", 0.2, (0.0, 9.0)), knob("on", "", 1.0, (0.0, 1.0))];
+        assert_eq!(set("fr.Fs = 310 mN·m", &all), Ok(vec![(0, 0.31)]));
+        assert_eq!(set("Ti=20 ms , fr.Fs = 0, on = false", &all), Ok(vec![(1, 0.02), (0, 0.0), (2, 0.0)]));
+        let endless = [knob("vd", "m/s", f64::INFINITY, (0.0, f64::INFINITY))];
+        assert_eq!(set("vd = inf", &endless), Ok(vec![(0, f64::INFINITY)]));
+        assert_eq!(set("vd = 3 mm/s", &endless), Ok(vec![(0, 0.003)]));
+        for (text, why) in [
+            ("Ti = inf", "does not begin with a number"),
+            ("fr.Fs = 0.3", "`fr.Fs` is"),
+            ("fr.Fs = 0.3 s", "type it as in 0.42 N·m"),
+            ("fr.Fx = 0.3 N·m", "did you mean `fr.Fs`?"),
+            ("fr.Fs 0.3 N·m", "write it as PATH = VALUE"),
+            ("Ti = 1 s, fr.Fs = x", "does not begin with a number"),
+            ("on = 2", "true or false"),
+            ("", "sets nothing"),
+        ] {
+            let found = set(text, &all);
+            assert!(found.as_ref().is_err_and(|found| found.contains(why)), "{text}: {found:?}");
+        }
+    }
+
+    #[test]
+    fn what_is_shown_is_read_back_to_the_same_value() {
+        let knob = knob("fr.Fs", "mN", 0.0, (-1e9, 1e9));
+        for i in -300..300 {
+            let si = f64::from(i) * 1.37e-5;
+            let again = knob.value(&knob.text(si)).unwrap();
+            assert!((again - si).abs() <= 1e-8 * si.abs(), "{si} {again}");
+        }
+    }
+}

@@ -1,0 +1,377 @@
+//! A recording of a rig: its cycles as curves, and what happened beside them.
+//!
+//! In: the messages of a log, one after the other. Out: curves thinned from their extremes at every scale, in bounded
+//! memory; events; a histogram of how late the cycles began.
+
+use super::sheet::{Sheet, Signal};
+use abi::format;
+use abi::rig::{Kind, Rig, SignalKind};
+use abi::unit::{Dimension, Unit};
+use abi::{Description, Slot};
+use panel::frame::{Block, COLUMNS, Frame, PATH};
+use panel::history::History;
+use panel::line::View;
+use panel::subject::Subject;
+use panel::thin;
+use panel::words::clean;
+use runtime::hil::control::{Control, Reading, Source};
+use runtime::hil::trace::{self, Cycle, Shape};
+use runtime::hil::words;
+use runtime::record::log::{LOST, Message};
+use runtime::safety::Clamps;
+use serde_json::{Value, json};
+use std::collections::{BTreeSet, VecDeque};
+
+/// Events that are kept, the newest.
+const EVENTS: usize = 2000;
+/// Bars of a decade in the histogram of lateness, and of all of it, from 1 µs.
+const PARTS: usize = 6;
+const BARS: usize = 5 * PARTS;
+/// Points of a path.
+const PATH_POINTS: u64 = 60_000;
+
+/// SignalKind happened at a time.
+struct Event {
+    cycle: u64,
+    kind: &'static str,
+    text: String,
+}
+
+/// A recording.
+pub struct Recording {
+    name: String,
+    rig: Rig,
+    description: Description,
+    shape: Shape,
+    signals: Vec<abi::rig::Signal>,
+    sheet: Sheet,
+    history: History,
+    row: Vec<f64>,
+    events: VecDeque<Event>,
+    /// For each output since which cycle it has been clamped.
+    clamped: Vec<Option<u64>>,
+    /// Causes of a stop that were told.
+    causes: BTreeSet<String>,
+    bars: [u64; BARS],
+    late_ns_max: u32,
+    cycles: u64,
+    missed: u64,
+    lost: u64,
+    ends: String,
+    /// Its first cycle.
+    first: Option<u64>,
+}
+
+/// The SI unit of a signal of a node.
+fn unit_of(rig: &Rig, signal: abi::rig::Signal) -> Unit {
+    let named = |name: &str| Unit::parse(name).expect("a known unit");
+    match (signal.what, &rig.nodes[signal.node].kind) {
+        (SignalKind::Torque, _) => named("N·m"),
+        (SignalKind::Speed, _) => named("rad/s"),
+        (SignalKind::Position, _) => named("rad"),
+        (SignalKind::Field(message, field), Kind::Frames(messages)) => {
+            let dimension = messages[message].fields[field].unit.dimension;
+            if dimension == Dimension::NONE { Unit::none() } else { Unit::si(dimension) }
+        }
+        (SignalKind::Enabled | SignalKind::Fault | SignalKind::Limited | SignalKind::Field(..), _) => Unit::none(),
+    }
+}
+
+impl Recording {
+    /// An empty recording of a rig. `keep`: bytes of its curves in memory.
+    pub fn new(name: &str, rig: &Rig, description: &Description, control: &Control, keep: u64) -> Recording {
+        let signals: Vec<abi::rig::Signal> = control.signals().collect();
+        let mut sheet = Sheet::default();
+        let recorded: Vec<usize> = rig.record.iter().map(|series| sheet.signal(Signal::of(series))).collect();
+        let mut all: Vec<Signal> = Vec::new();
+        for signal in &signals {
+            let boolean = matches!(signal.what, SignalKind::Enabled | SignalKind::Fault | SignalKind::Limited);
+            all.push(Signal { label: words::signal(rig, *signal), unit: unit_of(rig, *signal), boolean });
+        }
+        let readings = all.len();
+        for output in &rig.outputs {
+            for word in ["requested", "permitted"] {
+                let label = format!("{} {word}", words::signal(rig, output.signal));
+                all.push(Signal { label, unit: unit_of(rig, output.signal), boolean: false });
+            }
+        }
+        // Readings and commands keep their numbers also where a recorded quantity has the same name.
+        let begin = sheet.signals.len();
+        sheet.signals.extend(all);
+        sheet.place(&recorded, None);
+        sheet.place(&(begin..begin + readings).collect::<Vec<_>>(), None);
+        sheet.place(&(begin + readings..sheet.signals.len()).collect::<Vec<_>>(), None);
+        let count = sheet.signals.len();
+        Recording {
+            name: name.into(),
+            rig: rig.clone(),
+            description: description.clone(),
+            shape: Shape::of(rig, control),
+            signals,
+            sheet,
+            history: History::new(count, keep),
+            row: vec![0.0; count],
+            events: VecDeque::new(),
+            clamped: vec![None; rig.outputs.len()],
+            causes: BTreeSet::new(),
+            bars: [0; BARS],
+            late_ns_max: 0,
+            cycles: 0,
+            missed: 0,
+            lost: 0,
+            ends: String::new(),
+            first: None,
+        }
+    }
+
+    /// Adds a message of the log; false if it does not belong to this rig.
+    pub fn add(&mut self, message: &Message) -> bool {
+        match message.kind {
+            LOST => {
+                let lost = message.words.first().copied().unwrap_or(1);
+                self.lost += lost;
+                let at = self.history.cycles().end;
+                self.event(at, "bad", format!("{lost} messages were lost when it was written"));
+                true
+            }
+            trace::CYCLE => match Cycle::read(self.shape, &message.words) {
+                Some(cycle) => {
+                    self.cycle(&cycle);
+                    true
+                }
+                None => false,
+            },
+            _ => true,
+        }
+    }
+
+    /// Says how the log ends.
+    pub fn end(&mut self, ends: String) {
+        let end = self.history.cycles().end;
+        for output in 0..self.clamped.len() {
+            self.clamp(output, end, Clamps::default());
+        }
+        self.ends = ends;
+    }
+
+    /// Whether it holds a cycle.
+    pub fn is_empty(&self) -> bool {
+        self.cycles == 0
+    }
+
+    fn event(&mut self, cycle: u64, kind: &'static str, text: String) {
+        if self.events.len() == EVENTS {
+            self.events.pop_front();
+        }
+        self.events.push_back(Event { cycle, kind, text });
+    }
+
+    fn clamp(&mut self, output: usize, at: u64, clamps: Clamps) {
+        match (self.clamped[output], clamps != Clamps::default()) {
+            (None, true) => self.clamped[output] = Some(at),
+            (Some(since), false) => {
+                self.clamped[output] = None;
+                let name = words::signal(&self.rig, self.rig.outputs[output].signal);
+                let lasted = format::duration((at - since) as f64 * self.rig.period_ns as f64 * 1e-9, 3);
+                self.event(since, "warning", format!("{name} was clamped for {lasted}"));
+            }
+            (None, false) | (Some(_), true) => {}
+        }
+    }
+
+    fn cycle(&mut self, cycle: &Cycle) {
+        // A missed tick is a gap: what is drawn is the time at which a cycle was due.
+        let at = cycle.due_ns / self.rig.period_ns;
+        self.first.get_or_insert(at);
+        self.cycles += 1;
+        self.missed += u64::from(cycle.ticks.saturating_sub(1));
+        self.late_ns_max = self.late_ns_max.max(cycle.late_ns);
+        #[allow(clippy::disallowed_methods, reason = "a picture")]
+        let bar = (f64::from(cycle.late_ns.max(1000)) / 1000.0).log10() * PARTS as f64;
+        self.bars[(bar as usize).min(BARS - 1)] += 1;
+        let recorded = self.rig.record.iter().zip(&cycle.recorded).map(|(series, si)| series.unit.from_si(*si));
+        // A reading that has never come is no number.
+        let readings = cycle.readings.iter().map(|one| if one.age == Reading::NEVER { f64::NAN } else { one.value });
+        let commands = cycle.requests.iter().zip(&cycle.permitted).flat_map(|(asked, given)| [*asked, *given]);
+        for (place, value) in self.row.iter_mut().zip(recorded.chain(readings).chain(commands)) {
+            *place = value;
+        }
+        self.history.push(at, &self.row);
+        if cycle.arms {
+            let whose = match cycle.source {
+                Source::Model => "armed: the model runs",
+                Source::StartUp => "armed: the start-up moves the drives",
+                Source::Nobody => "armed",
+            };
+            self.event(at, "good", whose.into());
+        }
+        for (slot, si) in &cycle.set {
+            let text = self.set(*slot, *si);
+            self.event(at, "set", text);
+        }
+        for cause in &cycle.causes {
+            let why = words::cause(&self.rig, &self.description, &self.signals, *cause, None);
+            // A cause stands in every cycle from the first to the end.
+            if self.causes.insert(why.clone()) {
+                self.event(at, "bad", why);
+            }
+        }
+        for (output, clamps) in cycle.clamps.iter().enumerate() {
+            self.clamp(output, at, *clamps);
+        }
+    }
+
+    fn set(&self, slot: Slot, si: f64) -> String {
+        let quantity = self.description.quantities.iter().find(|quantity| quantity.slot == slot);
+        match quantity {
+            Some(quantity) => format!("{} = {}", quantity.path, format::quantity(si, &quantity.unit, 6)),
+            None => format!("slot {} = {si}", slot.0),
+        }
+    }
+
+    fn seconds(&self, cycle: u64) -> f64 {
+        cycle as f64 * self.rig.period_ns as f64 * 1e-9
+    }
+
+    /// Lateness in µs below which a part of all cycles began: the upper edge of its bar.
+    fn late(&self, part: f64) -> f64 {
+        let wanted = (part * self.cycles as f64).ceil() as u64;
+        let mut sum = 0;
+        let bar = self.bars.iter().position(|bar| {
+            sum += bar;
+            sum >= wanted
+        });
+        edge(bar.unwrap_or(BARS - 1) + 1)
+    }
+
+    /// Curves of the whole recording in this many columns, for a report.
+    pub fn curves(&self, columns: u32) -> Vec<(u32, Vec<(f64, f64)>)> {
+        let (first, count, width) = self.columns(None, columns);
+        let curve = |signal: usize| {
+            let pairs = self.history.columns(signal, first, count, width);
+            let points = pairs.iter().enumerate().flat_map(|(i, (a, b))| {
+                let begin = (first + i as u64) * width;
+                let halves = if width == 1 { [0.0, 0.0] } else { [0.25, 0.75] };
+                halves.map(|half| self.seconds(begin) + half * self.seconds(width)).into_iter().zip([*a, *b])
+            });
+            let mut points: Vec<(f64, f64)> = points.collect();
+            points.dedup();
+            points
+        };
+        (0..self.sheet.signals.len()).map(|signal| (signal as u32, curve(signal))).collect()
+    }
+
+    /// The first column of a window, their number, and cycles a column.
+    fn columns(&self, window: Option<(f64, f64)>, columns: u32) -> (u64, usize, u64) {
+        let all = self.history.cycles();
+        let (from, to) = match window {
+            Some((from, to)) => {
+                let cycle = |seconds: f64| (seconds / self.seconds(1)).clamp(0.0, 1e15) as u64;
+                (cycle(from).saturating_sub(1), cycle(to) + 2)
+            }
+            None => (self.first.unwrap_or(0).max(all.start), all.end),
+        };
+        let width = (to - from).div_ceil(u64::from(columns)).max(1);
+        let first = from / width;
+        (first, ((to.div_ceil(width) - first) as usize).min(columns as usize + 2), width)
+    }
+}
+
+/// The lower edge of a bar, µs.
+fn edge(bar: usize) -> f64 {
+    #[allow(clippy::disallowed_methods, reason = "a picture")]
+    10f64.powf(bar as f64 / PARTS as f64)
+}
+
+impl Subject for Recording {
+    fn hello(&self) -> (u64, Value) {
+        let (signals, canvases) = self.sheet.json();
+        let events = self
+            .events
+            .iter()
+            .rev()
+            .map(|event| json!({ "t": self.seconds(event.cycle), "kind": event.kind, "text": clean(&event.text) }));
+        let all = self.history.cycles();
+        let value = json!({
+            "kind": "recording",
+            "file": clean(&self.name),
+            "title": clean(&self.rig.name),
+            "experiments": [],
+            "cases": [""],
+            "signals": signals,
+            "canvases": canvases,
+            "knobs": [],
+            "from": self.seconds(self.first.unwrap_or(0).max(all.start)),
+            "to": self.seconds(all.end),
+            "period": self.seconds(1),
+            "solver": "",
+            "events": events.collect::<Vec<_>>(),
+            "late": {
+                "edges": (0..=BARS).map(edge).collect::<Vec<_>>(),
+                "counts": self.bars,
+                "p50": self.late(0.5),
+                "p99": self.late(0.99),
+                "max": f64::from(self.late_ns_max) * 1e-3,
+                "missed": self.missed,
+            },
+        });
+        (1, value)
+    }
+
+    fn state(&self) -> (u64, Value) {
+        let cut = self.first.is_some_and(|first| self.history.cycles().start > first);
+        let mut words = format!("{} cycles; {}", format::count(self.cycles), self.ends);
+        if cut {
+            words += "; its beginning does not fit into --keep";
+        }
+        if self.lost > 0 {
+            words += &format!("; {} messages were lost when it was written", format::count(self.lost));
+        }
+        (1, json!({ "values": [], "texts": [], "layers": [true], "kept": [], "words": clean(&words), "set": "" }))
+    }
+
+    fn version(&self) -> u64 {
+        1
+    }
+
+    fn newest(&self) -> f64 {
+        self.seconds(self.history.cycles().end)
+    }
+
+    fn blocks(&self, view: &View, since: Option<u64>, frame: &mut Frame) {
+        let count = self.sheet.signals.len();
+        if since.is_some() || view.signals.iter().any(|signal| *signal as usize >= count) {
+            return;
+        }
+        if let Some(columns) = view.columns {
+            let (first, count, width) = self.columns(view.window, columns);
+            for signal in &view.signals {
+                let pairs = self.history.columns(*signal as usize, first, count, width);
+                let cycles = u32::try_from(width).unwrap_or(u32::MAX);
+                frame.columns(
+                    Block { kind: COLUMNS, view: view.id, curve: *signal, cycles, first: first as f64 },
+                    &pairs,
+                );
+            }
+        } else if let [x, y] = view.signals[..] {
+            let all = self.history.cycles();
+            let (from, to) = match view.window {
+                Some((from, to)) => {
+                    let cycle = |seconds: f64| (seconds / self.seconds(1)).clamp(0.0, 1e15) as u64;
+                    (cycle(from).max(all.start), (cycle(to) + 1).min(all.end))
+                }
+                None => (all.start, all.end),
+            };
+            let to = to.min(from.saturating_add(PATH_POINTS));
+            let value = |signal: u32, cycle| self.history.value(signal as usize, cycle);
+            let points: Vec<(f64, f64)> = (from..to).map(|cycle| (value(x, cycle), value(y, cycle))).collect();
+            let points = thin::path(&points);
+            let first = points.first().map_or(0.0, |point| point.0);
+            frame.path(Block { kind: PATH, view: view.id, curve: y, cycles: 0, first }, &points);
+        }
+    }
+
+    fn say(&self, _: &str) -> Result<String, String> {
+        Err("a recording obeys nobody".into())
+    }
+}

@@ -1,0 +1,95 @@
+//! Recordings of rigs.
+
+use crate::browser::browser;
+use crate::{Panel, folder, fric};
+use serde_json::json;
+use std::fs;
+use std::path::PathBuf;
+
+/// A log of the rig of the example in simulated time.
+fn log(name: &str, seconds: u32) -> PathBuf {
+    let path = folder(name).join("rtfs.friclog");
+    let time = format!("{seconds}s");
+    let output = fric()
+        .args(["hil", "examples/rtfs/rtfs.fric", "--sim", "--fast", "--for", &time, "--log"])
+        .arg(&path)
+        .output()
+        .unwrap();
+    assert!(path.exists(), "{}{}", String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
+    path
+}
+
+#[test]
+fn a_recording_is_looked_through() {
+    let path = log("recording", 4);
+    let panel = Panel::open(&[path.to_str().unwrap()]);
+    let page = browser().page(&panel.link);
+    page.wait("document.querySelectorAll('.plot').length > 3");
+    page.wait("[...document.querySelectorAll('.plot canvas[role=img]')].every(c => / to .* at the end/.test(c.getAttribute('aria-label')))");
+    assert_eq!(page.text("document.getElementById('title').textContent"), "rtfs");
+    let sentence = page.text("document.getElementById('sentence').textContent");
+    assert!(sentence.starts_with("recording: ") && sentence.contains("cycles; it ended"), "{sentence}");
+    assert!(page.text("document.getElementById('happened').textContent").contains("armed: the model runs"));
+    assert!(page.text("document.getElementById('late').textContent").contains("0 missed"));
+    page.shot("recording");
+    // Zoomed in, each cycle is a point: the values are those of the exported table.
+    let csv = path.with_extension("csv");
+    let output = fric().args(["replay", path.to_str().unwrap(), "--csv"]).arg(&csv).output().unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let table = fs::read_to_string(&csv).unwrap();
+    let mut lines = table.lines();
+    let at = lines.next().unwrap().split(',').position(|name| name == "body.x [deg]").expect("a column");
+    let rows: Vec<(f64, f64)> = lines
+        .map(|line| {
+            let cells: Vec<&str> = line.split(',').collect();
+            (cells[1].parse().unwrap(), cells[at].parse().unwrap())
+        })
+        .collect();
+    let extremes = rows.iter().fold((f64::MAX, f64::MIN), |(low, high), row| (low.min(row.1), high.max(row.1)));
+    let told = page.text("document.querySelector('.plot canvas[role=img]').getAttribute('aria-label')");
+    let number = |word: &str| word.replace('−', "-").parse::<f64>().unwrap_or(f64::NAN);
+    let words: Vec<f64> = told.split([' ', ',']).map(number).filter(|x| x.is_finite()).collect();
+    for wanted in [extremes.0, extremes.1, rows.last().unwrap().1] {
+        assert!(words.iter().any(|word| (word - wanted).abs() <= 1e-3 * wanted.abs().max(1e-6)), "{wanted} in {told}");
+    }
+    // An event leads to its time.
+    page.value("document.querySelector('#happened button').click()");
+    page.wait("!/, 0 s to /.test(document.querySelector('.plot canvas[role=img]').getAttribute('aria-label'))");
+    page.media("prefers-color-scheme", "dark");
+    page.wait("new Promise(done => requestAnimationFrame(() => setTimeout(() => done(true), 200)))");
+    page.shot("recording-event-dark");
+    // A recording obeys nobody, and needs no control for it.
+    assert_eq!(page.value("document.getElementById('knobs').hidden"), json!(true));
+    assert_eq!(page.complaints(), [""; 0]);
+    let report = path.with_extension("html");
+    let output = fric().args(["panel", path.to_str().unwrap(), "--save"]).arg(&report).output().unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let page = browser().page(&format!("file://{}", report.display()));
+    page.wait("document.querySelectorAll('.plot').length > 3");
+    page.wait("/ to .* at the end/.test(document.querySelector('.plot canvas[role=img]').getAttribute('aria-label'))");
+    assert_eq!(page.complaints(), [""; 0]);
+}
+
+#[test]
+fn a_log_cut_off_by_a_crash_is_a_recording_too() {
+    let path = log("cut", 1);
+    let bytes = fs::read(&path).unwrap();
+    fs::write(&path, &bytes[..bytes.len() * 3 / 4]).unwrap();
+    let panel = Panel::open(&[path.to_str().unwrap()]);
+    let page = browser().page(&panel.link);
+    page.wait("document.getElementById('sentence')?.textContent.includes('cut off at byte')");
+    page.wait("document.querySelectorAll('.plot').length > 3");
+    drop(panel);
+    // One that is no log of anything is refused with its reason.
+    fs::write(&path, &bytes[..40]).unwrap();
+    let output = fric().args(["panel", path.to_str().unwrap(), "--no-open"]).output().unwrap();
+    assert_eq!(output.status.code(), Some(1));
+    assert!(String::from_utf8_lossy(&output.stderr).contains("head is cut off or damaged"));
+    let output = fric().args(["panel", "nowhere.fric", "--no-open"]).output().unwrap();
+    assert_eq!(output.status.code(), Some(1));
+    assert!(String::from_utf8_lossy(&output.stderr).contains("cannot read nowhere.fric: there is no such file"));
+    // The plant of a rig is another program: that its parameters have no effect must not look like a result.
+    let output = fric().args(["panel", "examples/rtfs/rtfs.fric", "--no-open"]).output().unwrap();
+    assert_eq!(output.status.code(), Some(1));
+    assert!(String::from_utf8_lossy(&output.stderr).contains("a rig cannot be varied yet"));
+}
