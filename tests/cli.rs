@@ -867,6 +867,13 @@ fn texts_come_from_a_pipe_and_pictures_go_into_one() {
     let picture = piped(&["run", "-", "silent", "--plot", "-"], PULL);
     let svg = String::from_utf8(picture.stdout).unwrap();
     assert!(picture.status.success() && svg.starts_with("<svg") && svg.trim_end().ends_with("</svg>"), "{svg}");
+    let rise = "model M { state x [mm] = 0  dx/dt = 1 mm/s }
+        experiment one { run M() for 1 s  plot x [mm] }
+        experiment two { run M() for 2 s  plot x [mm] }";
+    let common = piped(&["run", "-", "--plot", "-"], rise);
+    let svg = String::from_utf8(common.stdout).unwrap();
+    assert!(common.status.success() && svg.starts_with("<svg") && svg.trim_end().ends_with("</svg>"), "{svg}");
+    assert!(svg.contains(">one<") && svg.contains(">two<") && !folder.0.join("-").exists(), "{svg}");
     let table = piped(&["run", "-", "silent", "--data", "-"], PULL);
     assert!(String::from_utf8(table.stdout).unwrap().starts_with("t [s],x [mm]\n"));
     let failing = piped(&["run", "-", "breaks", "--data", "-"], PULL);
