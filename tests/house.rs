@@ -361,13 +361,9 @@ fn wording() -> Outcome {
 }
 
 /// Names that more than three types of a crate have, and why.
-const SHARED_NAMES: [(&str, &str, usize); 3] = [
+const SHARED_NAMES: [(&str, &str, usize); 1] = [
     // Those of a bus, of a start-up, of the computing part and of a run: each is written with its module.
     ("runtime", "Options", 4),
-    // Of an `expect`, of a polarity check, of the energy of a contact, of a machine: each is what its check returns.
-    ("runtime", "Verdict", 4),
-    // Of a value in code, of a quantity in a block, of a statement in a text.
-    ("compiler", "Place", 5),
 ];
 
 fn type_names() -> Outcome {

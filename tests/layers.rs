@@ -62,7 +62,7 @@ const HOMES: &[(&str, &[&str])] = &[
     ("rtrb", &["runtime/src/spsc.rs"]),
     ("rustix", &["runtime/src/record/parts.rs"]),
     ("rustyline", &["src/repl/line.rs"]),
-    ("rustc-hash", &["compiler/src/hash.rs"]),
+    ("rustc-hash", &["compiler/src/ir/hash.rs"]),
     // JSON is a form of every command's results, and what the page of a panel reads.
     ("serde_json", &["src/", "panel/src/"]),
     ("sha2", &["abi/src/image.rs"]),

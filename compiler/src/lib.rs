@@ -8,7 +8,6 @@
 
 #![cfg_attr(test, allow(clippy::disallowed_methods, reason = "tests compare with the platform's functions"))]
 
-mod hash;
 pub mod interval;
 pub mod functions;
 
@@ -819,7 +818,7 @@ fn steps(loaded: &Loaded, name: &str, changes: &Changes, variants: &[experiment:
         let lint = frontend::system::LINTS.iter().find(|(_, code)| *code == diagnostic.code);
         diagnostic.is_error() || lint.is_none_or(|(name, _)| !allowed.contains(name))
     });
-    let mut codes = crate::hash::HashSet::default();
+    let mut codes = crate::ir::hash::HashSet::default();
     said.retain(|diagnostic| codes.insert(diagnostic.code));
     said
 }
@@ -903,8 +902,8 @@ fn check_interface(loaded: &Loaded, sources: &dyn Sources, interface: &grammar::
 pub fn once(mut diagnostics: Vec<Diagnostic>) -> Vec<Diagnostic> {
     let errors = diagnostics.iter().any(Diagnostic::is_error);
     diagnostics.retain(|diagnostic| !errors || diagnostic.is_error());
-    let mut seen = crate::hash::HashSet::default();
-    let mut circles = crate::hash::HashSet::default();
+    let mut seen = crate::ir::hash::HashSet::default();
+    let mut circles = crate::ir::hash::HashSet::default();
     diagnostics.retain(|diagnostic| {
         // A cycle is found from each of its members; only the first is reported. The same holds for a program that
         // grows without bound, which is reported at each use.

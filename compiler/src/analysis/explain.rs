@@ -269,7 +269,7 @@ fn right_side(system: &System, files: &Files, left: grammar::span::Span, value: 
 
 fn mentioned(system: &System, id: ExprId) -> Vec<VarId> {
     let mut out = Vec::new();
-    let mut seen = crate::hash::HashSet::default();
+    let mut seen = crate::ir::hash::HashSet::default();
     let mut stack = vec![id];
     while let Some(id) = stack.pop() {
         if !seen.insert(id) {
@@ -350,7 +350,7 @@ pub fn states(system: &System, program: &Program) -> Vec<Stepped> {
 
 /// Whether a value depends on the content of a slot other than through the condition of a branch.
 fn depends(build: &Build, value: Value, slot: Slot) -> bool {
-    let mut seen = crate::hash::HashSet::default();
+    let mut seen = crate::ir::hash::HashSet::default();
     let mut stack = vec![value];
     while let Some(value) = stack.pop() {
         if !seen.insert(value) {
@@ -394,7 +394,7 @@ fn rate_independent(system: &System) -> Option<bool> {
     if states == 0 {
         return Some(false);
     }
-    let mut seen = crate::hash::HashSet::default();
+    let mut seen = crate::ir::hash::HashSet::default();
     while let Some(id) = roots.pop() {
         if !seen.insert(id) {
             continue;

@@ -10,8 +10,8 @@
 //! box at that number. Bounds are rounded outwards. A sum counts as zero if it is negative by no more than 1e-12 of its
 //! terms, because coefficients of equal products may differ in their last digits.
 
-use crate::hash::HashMap;
 use crate::interval::Interval;
+use crate::ir::hash::HashMap;
 use crate::ir::{Func, Op, Value};
 use abi::Slot;
 use std::collections::BTreeMap;

@@ -4,7 +4,7 @@
 //! In: a program and the other values on which the result depends. Out: the result, computed or cached; the same either
 //! way.
 
-use crate::hash::HashMap;
+use crate::ir::hash::HashMap;
 use crate::ir::program::Program;
 use std::collections::hash_map::DefaultHasher;
 use std::hash::{Hash, Hasher};

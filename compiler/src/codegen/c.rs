@@ -5,7 +5,7 @@
 //! products and sums (`-ffp-contract=off`, which `-std=c11` implies with gcc): where the model contracts, `fma` is
 //! explicit. A value that is used once is written inline; a value that is used more often, or stored, gets a name.
 
-use crate::hash::{HashMap, HashSet};
+use crate::ir::hash::{HashMap, HashSet};
 use crate::ir::{Func, Op, Type, Value, verify};
 use abi::description::Kind;
 use abi::unit::Unit;

@@ -8,8 +8,8 @@
 //! What the graph leaves open: a loop counts down the number of iterations, with one induction pointer for each stride; a
 //! branch on a compound condition of few tests becomes short-circuit branches; constants are rematerialised at each use.
 
-use crate::hash::{HashMap, HashSet};
 use crate::ir::cfg::{Area, BlockId, Cfg, Count, Entry, Inst, Part, Place, Target, Terminator};
+use crate::ir::hash::{HashMap, HashSet};
 use crate::ir::{Op, Type, Value, sign_of};
 use cranelift_codegen::ir::condcodes::{FloatCC, IntCC};
 use cranelift_codegen::ir::{

@@ -8,7 +8,7 @@
 use crate::codegen::emit::signature;
 use crate::codegen::loop_plan::{LoopPlan, StraightLine, plan};
 use crate::codegen::unsupported::Unsupported;
-use crate::hash::{HashMap, HashSet};
+use crate::ir::hash::{HashMap, HashSet};
 use crate::ir::scc::topological_order;
 use crate::ir::{Func, Op, Type, Value, verify};
 use abi::{Layout, Slot};

@@ -11,8 +11,8 @@
 //! Carried slots are parameters of b1 or, if they are many, remain in the block. Source: Lu, Cooper, *Register Promotion
 //! in C Programs*, PLDI 1997.
 
-use crate::hash::{HashMap, HashSet};
 use crate::ir::cfg::{Area, Block, BlockId, Cfg, Count, Entry, Inst, Part, Place, Target, Terminator};
+use crate::ir::hash::{HashMap, HashSet};
 use crate::ir::{Func, Op, Value};
 use abi::Slot;
 

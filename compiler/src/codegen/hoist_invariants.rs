@@ -5,8 +5,8 @@
 //!
 //! Source: Aho, Lam, Sethi, Ullman, *Compilers*, 2007, sec. 9.5.
 
-use crate::hash::HashSet;
 use crate::ir::cfg::{Area, BlockId, Cfg, Inst, Place};
+use crate::ir::hash::HashSet;
 use crate::ir::variance::{Slots, Variance, of_ops};
 use abi::Slot;
 

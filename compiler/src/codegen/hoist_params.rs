@@ -6,9 +6,9 @@
 //!
 //! Source: Aho, Lam, Sethi, Ullman, *Compilers*, 2007, sec. 9.5.
 
-use crate::hash::HashMap;
 use crate::ir::build::{Build, prune};
 use crate::ir::cfg::{BlockId, Cfg, Part};
+use crate::ir::hash::HashMap;
 use crate::ir::variance::{Variance, variance};
 use crate::ir::verify::types;
 use crate::ir::{Func, Op, Type, Value};

@@ -15,8 +15,8 @@
 //!
 //! Source: Kennedy, Allen, *Optimizing Compilers for Modern Architectures*, 2001, ch. 5.
 
-use crate::hash::HashSet;
 use crate::ir::cfg::{BlockId, Cfg, Leading};
+use crate::ir::hash::HashSet;
 use crate::ir::variance::{Variance, variance};
 use crate::ir::{Func, Op, Type, Value, verify};
 use abi::{Layout, Slot};

@@ -12,7 +12,7 @@
 //! block | first area of carried slots | second area | hoisted values | end
 //! ```
 
-use crate::hash::HashSet;
+use crate::ir::hash::HashSet;
 use crate::ir::variance::{Slots, Variance, propagate};
 use abi::Slot;
 use std::hash::Hash;

@@ -18,8 +18,8 @@
 use crate::codegen::form_loop::is_idempotent;
 use crate::codegen::reroll::{Repeats, Row, Source, arithmetic_progression, repeats};
 use crate::codegen::side_exit::{cold, tested};
-use crate::hash::{HashMap, HashSet};
 use crate::ir::cfg::{Area, Block, BlockId, Cfg, Count, Entry, Inst, Part, Place, Target, Terminator};
+use crate::ir::hash::{HashMap, HashSet};
 use crate::ir::variance::{Variance, variance};
 use crate::ir::{Func, Op, Value, Write};
 use abi::Slot;

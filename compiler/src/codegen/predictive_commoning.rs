@@ -9,8 +9,8 @@
 //! elements*, IBM Interdivisional Technical Liaison, 1990; states take the place of array elements.
 
 use crate::codegen::form_loop::MAX_IN_REGISTERS;
-use crate::hash::{HashMap, HashSet};
 use crate::ir::cfg::{BlockId, Cfg, Inst, Terminator};
+use crate::ir::hash::{HashMap, HashSet};
 use crate::ir::{Func, Op, Type, Value};
 use std::collections::BTreeSet;
 

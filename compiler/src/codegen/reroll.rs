@@ -8,7 +8,7 @@
 //!
 //! Compare Rocha et al., *Loop Rolling for Code Size Reduction*, CGO 2022, and LLVM's `LoopReroll`.
 
-use crate::hash::HashMap;
+use crate::ir::hash::HashMap;
 use crate::ir::{Func, Op, Value};
 use abi::Slot;
 use std::hash::{BuildHasher, BuildHasherDefault, DefaultHasher};

@@ -7,8 +7,8 @@
 //!
 //! Source: Warter, Mahlke, Hwu, Rau, *Reverse If-Conversion*, PLDI 1993.
 
-use crate::hash::{HashMap, HashSet};
 use crate::ir::cfg::{Block, BlockId, Cfg, Part, Run, Target, Terminator};
+use crate::ir::hash::{HashMap, HashSet};
 use crate::ir::{Op, Value};
 
 /// Turns selects of all blocks into branches.

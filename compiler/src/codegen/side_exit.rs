@@ -7,8 +7,8 @@
 //! Compare Dynamo's side exits: Bala, Duesterwald, Banerjia, *Dynamo: A Transparent Dynamic Optimization System*, PLDI
 //! 2000; Appel, Reppy 1996 call the rule for what moves partial dead code elimination, as Knoop, Rüthing, Steffen do.
 
-use crate::hash::{HashMap, HashSet};
 use crate::ir::cfg::{Block, BlockId, Cfg, Inst, Part, Target, Terminator};
+use crate::ir::hash::{HashMap, HashSet};
 use crate::ir::{Func, Op, Type, Value};
 
 /// The value that is tested after a step, and the value that matters only if that test fails.

@@ -6,8 +6,8 @@
 //!
 //! Compare LLVM's `Sink` pass; Knoop, Rüthing, Steffen, *Partial Dead Code Elimination*, PLDI 1994.
 
-use crate::hash::HashMap;
 use crate::ir::cfg::{Cfg, Part, Run};
+use crate::ir::hash::HashMap;
 use crate::ir::{Op, Value};
 
 /// Sinks cheap operations in all blocks that are not cold.

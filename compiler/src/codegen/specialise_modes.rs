@@ -17,9 +17,9 @@
 //! 1993.
 
 use crate::codegen::side_exit::{cold, tested};
-use crate::hash::{HashMap, HashSet};
 use crate::ir::build::Build;
 use crate::ir::cfg::{Block, BlockId, Cfg, Inst, Part, Place, Target, Terminator};
+use crate::ir::hash::{HashMap, HashSet};
 use crate::ir::partial_eval::{known, partial_eval, slice};
 use crate::ir::{Func, Op, Type, Value, number_asked};
 use abi::Slot;

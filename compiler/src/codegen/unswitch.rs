@@ -7,9 +7,9 @@
 //! Source: Allen, Cocke, *A Catalogue of Optimizing Transformations*, 1972, there for loops.
 
 use crate::codegen::specialise_modes::shared_operands;
-use crate::hash::HashSet;
 use crate::ir::build::Build;
 use crate::ir::cfg::{Block, BlockId, Cfg, Inst, Part, Terminator};
+use crate::ir::hash::HashSet;
 use crate::ir::partial_eval::{known, partial_eval, slice};
 use crate::ir::{Func, Op, Value};
 

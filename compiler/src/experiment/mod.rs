@@ -847,7 +847,7 @@ impl Reader<'_> {
 
 /// Whether an expression depends on a quantity that satisfies `of`.
 pub fn depends(system: &System, expr: ExprId, of: &dyn Fn(&Var) -> bool) -> bool {
-    let mut seen = crate::hash::HashSet::default();
+    let mut seen = crate::ir::hash::HashSet::default();
     let mut stack = vec![expr];
     while let Some(id) = stack.pop() {
         if !seen.insert(id) {

@@ -7,7 +7,7 @@
 use crate::frontend::delays;
 use crate::frontend::source::Files;
 use crate::frontend::system::*;
-use crate::hash::HashMap;
+use crate::ir::hash::HashMap;
 use crate::ir::scc::components;
 use grammar::diagnostic::Diagnostic;
 use grammar::span::Span;

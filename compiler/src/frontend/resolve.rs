@@ -4,7 +4,7 @@
 
 use crate::frontend::names::nearest;
 use crate::frontend::source::{Files, SourceFile, Sources, Tree};
-use crate::hash::HashMap;
+use crate::ir::hash::HashMap;
 use grammar::ast::{self, Item, Name};
 use grammar::diagnostic::Diagnostic;
 use grammar::outline::heads;

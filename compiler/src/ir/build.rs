@@ -8,7 +8,7 @@
 use super::eval::evaluate;
 use super::verify::{result, types};
 use super::{Binary, Func, Op, Type, Unary, Value, Write};
-use crate::hash::HashMap;
+use crate::ir::hash::HashMap;
 use abi::Slot;
 use std::collections::BTreeMap;
 use std::sync::Arc;

@@ -9,7 +9,7 @@
 //! Cranelift and MLIR.
 
 use super::{Func, Op, Type, Value, Write, build, reads, verify};
-use crate::hash::{HashMap, HashSet};
+use crate::ir::hash::{HashMap, HashSet};
 use abi::{Layout, Slot};
 use std::collections::BTreeSet;
 

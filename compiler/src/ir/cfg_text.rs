@@ -19,7 +19,7 @@
 use super::cfg::{Area, Block, BlockId, Cfg, Count, Entry, Inst, Part, Place, Target, Terminator};
 use super::parse::{Line, ParseError, unexpected};
 use super::{Op, Value, Write};
-use crate::hash::{HashMap, HashSet};
+use crate::ir::hash::{HashMap, HashSet};
 use abi::Slot;
 use std::fmt;
 

@@ -3,9 +3,9 @@
 //! In: functions, a block and a pool of constants. Out: the changed block and the status. Every back end must agree
 //! with it to the bit.
 
-use crate::hash::HashMap;
 use crate::ir::cfg::{Area, BlockId, Cfg, Count, Inst, Place, Terminator};
 use crate::ir::eval::evaluate;
+use crate::ir::hash::HashMap;
 use crate::ir::verify::{Stage, verify};
 use crate::ir::{Func, Op, Value};
 use abi::table::Interpret;

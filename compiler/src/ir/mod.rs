@@ -4,6 +4,7 @@
 //! calls, so the interpreter, automatic differentiation and every back end walk the list once and match on the
 //! operation. After `lower` the IR has no units; names are only used for printing.
 
+pub mod hash;
 pub mod scc;
 pub mod print;
 pub mod parse;

@@ -5,7 +5,7 @@
 //! [`verify`](super::verify) checks that values exist and types match.
 
 use super::{Binary, Func, Op, Unary, Value, Write};
-use crate::hash::HashMap;
+use crate::ir::hash::HashMap;
 use abi::{Layout, Slot};
 use std::fmt;
 use std::str::FromStr;

@@ -8,7 +8,7 @@
 
 use super::build::Build;
 use super::{Op, Value};
-use crate::hash::{HashMap, HashSet};
+use crate::ir::hash::{HashMap, HashSet};
 
 /// The values that are known if a condition is known to be `truth`, each with its constant: the condition, its parts,
 /// and comparisons that follow from it.

@@ -9,7 +9,7 @@
 //! levels.
 
 use super::{Func, Op};
-use crate::hash::HashSet;
+use crate::ir::hash::HashSet;
 use abi::{Layout, Slot};
 
 /// The most variable quantity that a value depends on. Each level includes those before it.

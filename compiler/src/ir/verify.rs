@@ -25,7 +25,7 @@ pub fn verify(func: &Func, layout: &Layout, pool_len: usize, stage: Stage) -> Re
         Ok(types) => types,
         Err(what) => return fault(what),
     };
-    let touched: crate::hash::HashSet<Slot> =
+    let touched: crate::ir::hash::HashSet<Slot> =
         func.loads().into_iter().chain(func.stores.iter().map(|(slot, _)| *slot)).collect();
     let ring = |base: Slot, len: u32| {
         let (start, end) = (base.0, base.0 as u64 + u64::from(len));
@@ -61,7 +61,7 @@ pub fn verify(func: &Func, layout: &Layout, pool_len: usize, stage: Stage) -> Re
             _ => {}
         }
     }
-    let mut stored = crate::hash::HashSet::default();
+    let mut stored = crate::ir::hash::HashSet::default();
     for &(slot, value) in &func.stores {
         if !storable(slot, layout) {
             return fault(format!("a store to slot {}, which no function may write", slot.0));

@@ -3,9 +3,9 @@
 //! In: a [`System`] without algebraic loops, its [`Types`], and the expressions to observe. Out: a [`Program`]. Later
 //! stages know no units, and use names for printing only.
 
+mod lookup;
 mod emit;
 mod evaluate;
-mod lookup;
 mod roots;
 mod transitions;
 
@@ -18,8 +18,8 @@ use crate::frontend::causality::Phase;
 use crate::frontend::delays;
 use crate::frontend::system::*;
 use crate::frontend::units::Types;
-use crate::hash::{HashMap, HashSet};
 use crate::ir::Func;
+use crate::ir::hash::{HashMap, HashSet};
 use crate::ir::program::Program;
 use crate::lower::lookup::Lookup;
 use crate::ranges::reach::Reach;

@@ -4,7 +4,7 @@ use super::Plan;
 use super::emit::Emit;
 use crate::frontend::causality::{Phase, rate_of, value_of};
 use crate::frontend::system::*;
-use crate::hash::{HashMap, HashSet};
+use crate::ir::hash::{HashMap, HashSet};
 use crate::ir::{Func, Unary, Value};
 use abi::description::{Root, Slot};
 use grammar::ast::BinaryOp;

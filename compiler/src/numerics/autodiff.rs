@@ -9,9 +9,9 @@
 //! Source: Griewank, Walther, *Evaluating Derivatives*, 2008, ch. 3 and 7.
 
 use crate::functions::Term;
-use crate::hash::HashMap;
 use crate::ir::build::{Build, Env};
 use crate::ir::expr::{Real, Shared};
+use crate::ir::hash::HashMap;
 use crate::ir::program::Program;
 use crate::ir::{Func, Op, Value};
 use abi::Slot;

@@ -12,9 +12,9 @@
 //! Sources: Steinebach, BIT 63:27, 2023 (method); Hairer, Wanner, *Solving ODEs II*, IV.7 and IV.8 (stages, step
 //! control).
 
-use crate::hash::HashSet;
 use crate::ir::build::{Build, Env};
 use crate::ir::expr::{Int, Real, Shared, Truth};
+use crate::ir::hash::HashSet;
 use crate::ir::program::Program;
 use crate::ir::{Func, Op, Unary, Value};
 use crate::math::POOL;

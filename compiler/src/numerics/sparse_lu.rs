@@ -6,8 +6,8 @@
 //!
 //! Source: Duff, Erisman, Reid, *Direct Methods for Sparse Matrices*, 1986; order of elimination: Markowitz, 1957.
 
-use crate::hash::HashMap;
 use crate::ir::expr::{Real, Truth};
+use crate::ir::hash::HashMap;
 use crate::numerics::autodiff::Gradient;
 use std::collections::BTreeMap;
 

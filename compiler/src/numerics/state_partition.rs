@@ -5,7 +5,7 @@
 //!
 //! Source: Duff, Erisman, Reid, *Direct Methods for Sparse Matrices*, 1986, ch. 6 (block triangular form).
 
-use crate::hash::HashMap;
+use crate::ir::hash::HashMap;
 use crate::ir::scc::components;
 use crate::ir::{Func, Op, Value};
 use crate::numerics::switching_conditions::asks;

@@ -5,8 +5,8 @@
 //!
 //! Source: Hairer, Nørsett, Wanner, *Solving ODEs I*, II.6 (discontinuities and switching functions).
 
-use crate::hash::HashMap;
 use crate::ir::build::{Build, Env, prune};
+use crate::ir::hash::HashMap;
 use crate::ir::{Func, Op, Value};
 use abi::Slot;
 

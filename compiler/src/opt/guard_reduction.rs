@@ -11,8 +11,8 @@
 //! The method is ours; it is a case of redundant check elimination (Gupta, *Optimizing Array Bound Checks Using Flow
 //! Analysis*, 1993).
 
-use crate::hash::HashSet;
 use crate::ir::build::{Build, prune};
+use crate::ir::hash::HashSet;
 use crate::ir::partial_eval::{partial_eval, slice};
 use crate::ir::{Func, Op, Value};
 

@@ -17,8 +17,8 @@
 //! Sources: Briggs, Cooper, *Effective Partial Redundancy Elimination*, 1994 (reassociation by rank); Parker,
 //! *Combinatorial Merging and Huffman's Algorithm*, 1979 (operands that are ready first are combined first).
 
-use crate::hash::HashSet;
 use crate::ir::build::Build;
+use crate::ir::hash::HashSet;
 use crate::ir::{Func, Op, Value};
 use abi::Slot;
 

@@ -11,8 +11,8 @@
 use crate::frontend::causality::rate_of;
 use crate::frontend::system::*;
 use crate::functions::{self, Binary};
-use crate::hash::HashMap;
 use crate::interval::{Interval, SLACK, planted};
+use crate::ir::hash::HashMap;
 use abi::description::TINY;
 pub use abi::live::{greatest, least};
 use grammar::ast::BinaryOp;

@@ -182,7 +182,7 @@ fn conditions(system: &System, types: &Types, files: &Files, fixed: &Fixed, want
 /// For each quantity, whether one of the expressions depends on it, directly or through other quantities.
 pub(super) fn reached(system: &System, exprs: &[ExprId]) -> Vec<bool> {
     let mut vars = vec![false; system.vars.len()];
-    let mut seen = crate::hash::HashSet::default();
+    let mut seen = crate::ir::hash::HashSet::default();
     let mut stack = exprs.to_vec();
     while let Some(id) = stack.pop() {
         if !seen.insert(id) {

@@ -5,7 +5,7 @@
 //!
 //! Source: Intel 64 and IA-32 Architectures Software Developer's Manual, volume 2, sections 2.3 and 2.7.
 
-use crate::hash::HashMap;
+use crate::ir::hash::HashMap;
 
 /// Kind of vector.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]

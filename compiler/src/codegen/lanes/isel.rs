@@ -9,7 +9,7 @@
 
 use crate::codegen::lanes::assembler::{Instruction, Vectors, instructions as i};
 use crate::codegen::unsupported::Unsupported;
-use crate::hash::HashMap;
+use crate::ir::hash::HashMap;
 use crate::ir::{Func, Op, Type, Unary, Value, is_not_positive, sign_of, verify};
 use crate::math::{self, exponential, tables};
 use abi::Slot;

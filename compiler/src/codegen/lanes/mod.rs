@@ -27,7 +27,7 @@ use crate::codegen::lanes::assembler::{Assembler, Base, Vectors, instructions};
 use crate::codegen::lanes::isel::{MachineOp, NodeId, select};
 use crate::codegen::lanes::regalloc::{Home, RegisterAllocator, place_in};
 use crate::codegen::loop_plan::{LoopPlan, plan};
-use crate::hash::HashMap;
+use crate::ir::hash::HashMap;
 use crate::ir::verify::{Stage, verify};
 use crate::ir::{Func, Op, Unary};
 use crate::math;

@@ -10,7 +10,7 @@
 
 use crate::codegen::lanes::assembler::{Assembler, Base, Instruction, Place, Vectors, ZEROING, instructions as i};
 use crate::codegen::lanes::isel::{Direction, MachineOp, NodeId, Nodes, Signs};
-use crate::hash::HashMap;
+use crate::ir::hash::HashMap;
 use crate::math;
 use std::ops::Range;
 

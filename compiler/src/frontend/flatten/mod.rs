@@ -14,7 +14,7 @@ use crate::frontend::names::nearest;
 use crate::frontend::resolve::{ItemRef, Loaded, Lookup, RESERVED, Space, declared_twice, reserved};
 use crate::frontend::source::Sources;
 use crate::frontend::system::*;
-use crate::hash::HashMap;
+use crate::ir::hash::HashMap;
 use abi::unit::{Angle, Dimension, Unit};
 use grammar::ast::{self, BinaryOp, DeclarationKind, Expr, ExprKind, Item, Name, Statement, Target, UnaryOp};
 use grammar::diagnostic::{Diagnostic, Recurring};

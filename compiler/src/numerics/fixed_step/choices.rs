@@ -1,8 +1,8 @@
 //! Slopes that are selected among a few values which depend on no state: each gets its own exponential.
 
 use super::Model;
-use crate::hash::HashSet;
 use crate::ir::build::Build;
+use crate::ir::hash::HashSet;
 use crate::ir::{Op, Value};
 
 /// Largest number of slopes among which a rate may select for each slope to have its own exponential.

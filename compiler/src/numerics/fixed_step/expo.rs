@@ -3,8 +3,8 @@
 //! Source: Hochbruck, Ostermann, *Exponential integrators*, Acta Numerica 2010.
 
 use super::Model;
-use crate::hash::HashMap;
 use crate::ir::expr::{Real, Truth};
+use crate::ir::hash::HashMap;
 use crate::ir::{Func, Op, Value};
 use crate::math::phi_functions;
 use crate::numerics::autodiff;

@@ -10,9 +10,9 @@
 mod choices;
 mod expo;
 
-use crate::hash::HashSet;
 use crate::ir::build::{Build, Env};
 use crate::ir::expr::{Int, Real, Shared, Truth};
+use crate::ir::hash::HashSet;
 use crate::ir::program::Program;
 use crate::ir::{Func, Value, Write};
 use crate::numerics::autodiff::{self, Gradient};
