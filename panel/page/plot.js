@@ -16,7 +16,7 @@ export function ticks(low, high, most) {
 /** A range with some space, never empty. @param {number} low @param {number} high */
 function airy(low, high) {
   if (low > high) return [-1, 1];
-  const space = high > low ? 0.06 * (high - low) : Math.max(0.1 * Math.abs(high), 1e-12);
+  const space = high > low ? 0.06 * (high - low) : high === 0 ? 1 : 0.1 * Math.abs(high);
   return [low - space, high + space];
 }
 
