@@ -447,11 +447,7 @@ pub fn dissipation(
     else {
         return None;
     };
-    let path = |bind: &ast::Bind| ast::Path {
-        segments: vec![ast::Segment { name: bind.name.clone(), index: None }],
-        span: bind.name.span,
-    };
-    let paths: Vec<ast::Path> = instance.args.iter().map(path).collect();
+    let paths: Vec<ast::Path> = instance.args.iter().map(ast::Bind::path).collect();
     let given = paths.iter().zip(&instance.args).map(|(path, bind)| {
         let value = match &bind.value {
             ast::BindValue::Expr(expr) => frontend::flatten::OverrideValue::Expr(expr),
@@ -714,7 +710,12 @@ pub fn check(loaded: &mut Loaded, sources: &dyn Sources) -> Vec<Diagnostic> {
                     Err(errors) => all.extend(errors),
                 }
             }
-            Item::Model(_) | Item::Function(_) | Item::Const(_) | Item::Table(_) | Item::Interface(_) => {
+            Item::Model(_)
+            | Item::Variant(_)
+            | Item::Function(_)
+            | Item::Const(_)
+            | Item::Table(_)
+            | Item::Interface(_) => {
                 check_declaration(loaded, sources, item, true, &mut all);
             }
             Item::Import(_) | Item::Device(_) => {}
@@ -751,12 +752,29 @@ fn check_declaration(loaded: &Loaded, sources: &dyn Sources, item: &Item, physic
             all.extend(diagnostics);
         }
         Item::Interface(interface) => all.extend(check_interface(loaded, sources, interface)),
+        Item::Variant(variant) => all.extend(check_variant(loaded, sources, variant)),
         Item::Experiment(_) | Item::Fit(_) | Item::Rig(_) | Item::Import(_) | Item::Device(_) => {}
     }
 }
 
 /// Errors that may follow from an unreadable declaration.
 const MISSING: [&str; 7] = ["E0106", "E0203", "E0204", "E0205", "E0206", "E0303", "E0501"];
+
+/// The errors of a variant on its own: what is wrong with its arguments, and what they make wrong in its model.
+fn check_variant(loaded: &Loaded, sources: &dyn Sources, variant: &grammar::ast::Variant) -> Vec<Diagnostic> {
+    let request = frontend::flatten::Request {
+        instance: frontend::flatten::Instance::Variant(&variant.instance, loaded.root()),
+        overrides: Vec::new(),
+        observed: Vec::new(),
+        data: Vec::new(),
+        frame: None,
+    };
+    let frontend::flatten::Flattened { system, mut diagnostics, .. } =
+        frontend::flatten::flatten(loaded, sources, &request);
+    analyse(&system, &loaded.files, Depth::Values, &Diagnostic::is_error, &mut diagnostics);
+    diagnostics.retain(Diagnostic::is_error);
+    diagnostics
+}
 
 /// Limit on the combinations of one experiment whose steps are checked.
 const MOST_STEPPED: usize = 4;

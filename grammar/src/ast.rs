@@ -52,6 +52,7 @@ pub enum Item {
     Table(Table),
     Interface(Interface),
     Model(Model),
+    Variant(Variant),
     Experiment(Experiment),
     Fit(Fit),
     Device(Device),
@@ -155,6 +156,16 @@ pub struct Interface {
 pub struct Model {
     pub name: Name,
     pub body: Vec<Statement>,
+    pub doc: Option<String>,
+    pub span: Span,
+}
+
+/// `model TableLuGre = LuGre(Fc = 60 N)`: a model with other values, under a name of its own.
+#[derive(Clone, PartialEq, Debug)]
+#[allow(missing_docs)]
+pub struct Variant {
+    pub name: Name,
+    pub instance: Instance,
     pub doc: Option<String>,
     pub span: Span,
 }
@@ -309,13 +320,24 @@ pub struct Instance {
     pub span: Span,
 }
 
-/// One argument of an instance: `v = body.v`, `fr = LuGre()`.
+/// One argument of an instance: `v = body.v`, `fr = LuGre()`, `ctl.Kx = 10 1/s`.
 #[derive(Clone, PartialEq, Debug)]
 #[allow(missing_docs)]
 pub struct Bind {
+    /// The first name.
     pub name: Name,
+    /// The whole path, if it goes into a part: `ctl.Kx = 10 1/s`.
+    pub inner: Option<Path>,
     pub value: BindValue,
     pub span: Span,
+}
+
+impl Bind {
+    /// The path of what it sets.
+    pub fn path(&self) -> Path {
+        let one = || Path { segments: vec![Segment { name: self.name.clone(), index: None }], span: self.name.span };
+        self.inner.clone().unwrap_or_else(one)
+    }
 }
 
 /// Value of an argument.
@@ -461,6 +483,8 @@ pub struct Solver {
 #[allow(missing_docs)]
 pub struct Sweep {
     pub path: Path,
+    /// Further paths that take the same values: `sweep x.fr, y.fr = LuGre(), KFM()`.
+    pub also: Vec<Path>,
     pub over: SweepOver,
     pub span: Span,
 }

@@ -412,6 +412,7 @@ impl<'t> Reader<'t> {
         let word = self.source.word(piece.start);
         let place = match word {
             "interface" => Place::Interface,
+            "model" if block.is_none() && self.source.word(piece.start + 2) == "=" => return self.plain_item(piece),
             "model" => Place::Model,
             "experiment" => Place::Experiment,
             "fit" => Place::Fit,
@@ -508,6 +509,11 @@ impl<'t> Reader<'t> {
                     ),
                 };
                 Item::Table(Table { name, arg, unit, shape, points, doc, span })
+            }
+            Rule::variant => {
+                let name = self.name(children.one());
+                children.maybe(Rule::eq);
+                Item::Variant(Variant { name, instance: self.instance(children.one()), doc, span })
             }
             Rule::dbc_device => {
                 let name = self.name(Children::of(children.one()).one());
@@ -1043,14 +1049,16 @@ impl<'t> Reader<'t> {
         let args = children.all(Rule::bind).into_iter().map(|bind| {
             let span = self.span(&bind);
             let mut children = Children::of(bind);
-            let name = self.name(children.one());
+            let path = self.path(children.one());
             children.maybe(Rule::eq);
             let value = children.one();
             let value = match value.as_rule() {
                 Rule::inst => BindValue::Instance(self.instance(value)),
                 _ => BindValue::Expr(self.expr(value)),
             };
-            Bind { name, value, span }
+            let name = path.segments[0].name.clone();
+            let inner = if path.single().is_some() { None } else { Some(path) };
+            Bind { name, inner, value, span }
         });
         let args = args.collect();
         Instance { rotary, model, args, span }
@@ -1102,6 +1110,7 @@ impl<'t> Reader<'t> {
         let mut children = Children::of(pair);
         let path = children.one();
         let path = self.path(path);
+        let also = children.all(Rule::path).into_iter().map(|path| self.path(path)).collect();
         children.maybe(Rule::eq);
         let instances = children.all(Rule::inst);
         let over = if let Some(word) = spacing {
@@ -1118,7 +1127,7 @@ impl<'t> Reader<'t> {
         } else {
             SweepOver::Instances(instances.into_iter().map(|instance| self.instance(instance)).collect())
         };
-        Sweep { path, over, span }
+        Sweep { path, also, over, span }
     }
 
     fn shows(&mut self, children: &mut Children<'t>) -> Vec<Show> {

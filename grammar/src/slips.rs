@@ -30,7 +30,6 @@ pub(crate) fn explain(source: &Source, piece: Piece, stop: &Stop) -> Diagnostic 
         unit,
         bare_unit,
         reserved,
-        deeper,
         missing,
         neighbours,
         model_name,
@@ -289,30 +288,6 @@ pub(crate) fn block_comment(source: &Source) -> Option<Diagnostic> {
         Diagnostic::error("E0001", "a comment goes from `//` to the end of its line")
             .label(span, "no comment here")
             .help("begin each of its lines with `//`"),
-    )
-}
-
-/// Reports `run M(fr.Fs = 1 N)`: an argument of a part.
-fn deeper(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
-    let at = stop.at;
-    let names = at > piece.start
-        && source.is_symbol(at, ".")
-        && source.kind(at - 1) == Some(TokenKind::Word)
-        && source.kind(at + 1) == Some(TokenKind::Word);
-    if !names || !stop.expected.iter().any(|expected| expected == "`=`") {
-        return None;
-    }
-    let mut last = at + 1;
-    while source.is_symbol(last + 1, ".") && source.kind(last + 2) == Some(TokenKind::Word) {
-        last += 2;
-    }
-    let (path, part, name) = (slice(source, at - 1, last), source.word(at - 1), source.word(last));
-    Some(
-        Diagnostic::error("E0001", "an argument is a name of the model itself, not of its parts")
-            .label(source.span(at - 1).to(source.span(last)), "")
-            .help(format!(
-                "where `{part}` is a slot, give the model in it: `{part} = Model({name} = ...)`;\nelse set it from outside: `sweep {path} = ...` in an experiment, `--set {path}=...` for one run"
-            )),
     )
 }
 

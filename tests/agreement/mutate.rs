@@ -321,6 +321,7 @@ fn named(item: &Item) -> (Option<String>, Span) {
         Item::Table(item) => (Some(item.name.text.clone()), item.span),
         Item::Interface(item) => (Some(item.name.text.clone()), item.span),
         Item::Model(item) => (Some(item.name.text.clone()), item.span),
+        Item::Variant(item) => (Some(item.name.text.clone()), item.span),
         Item::Experiment(item) => (None, item.span),
         Item::Fit(item) => (None, item.span),
         Item::Device(item) => (Some(item.name.text.clone()), item.span),
@@ -364,6 +365,7 @@ impl Found {
                 }
             }
             Item::Model(model) => model.body.iter().for_each(|statement| self.statement(statement)),
+            Item::Variant(variant) => self.instance(&variant.instance),
             Item::Experiment(experiment) => {
                 for statement in &experiment.body {
                     match statement {

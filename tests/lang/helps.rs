@@ -144,11 +144,6 @@ const SLIPS: &[(&str, &str, &str)] = &[
         "experiment e { run SpringBench(fr = LuGre()) for 1 s  expect max(x) < 1 m }",
     ),
     (
-        "experiment e { run SpringBench(fr.Fv = 2 N·s/m) for 1 s  expect max(x) < 1 m }",
-        "`sweep fr.Fv = ...` in an experiment",
-        "experiment e { run SpringBench() for 1 s  sweep fr.Fv = 2 N·s/m  expect max(x) < 1 m }",
-    ),
-    (
         "model A { part b = ForceBench(u = 1 N)  output x [m] = b.x }\nexperiment e { run A(b = ForceBench(fr = LuGre())) for 1 s  expect max(x) < 1 m }",
         "`sweep b.NAME = …`",
         "model A { part b = ForceBench(u = 1 N)  output x [m] = b.x }\nexperiment e { run A() for 1 s  sweep b.fr = LuGre()  expect max(x) < 1 m }",

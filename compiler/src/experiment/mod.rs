@@ -257,12 +257,8 @@ pub fn read(
         return Err(vec![error.help(format!("between 1 and {MOST_VARIANTS} combinations can be run"))]);
     }
     // Arguments of a rig are changes of the system that it runs.
-    let path = |bind: &ast::Bind| ast::Path {
-        segments: vec![ast::Segment { name: bind.name.clone(), index: None }],
-        span: bind.span,
-    };
     let args = prepared.as_ref().map_or(&[][..], |_| &parts.run.instance.args);
-    let arg_paths: Vec<ast::Path> = args.iter().map(path).collect();
+    let arg_paths: Vec<ast::Path> = args.iter().map(ast::Bind::path).collect();
     let mut variants = Vec::new();
     for combination in combinations {
         let label = label(loaded, &combination);
@@ -278,7 +274,16 @@ pub fn read(
         let mut parts = parts.clone();
         parts.expects.retain(applies);
         let parts = &parts;
-        let changes = combination.iter().map(|(change, _)| *change).chain(given.set.iter().map(CommandLine::change));
+        // Further paths of a sweep take the same value.
+        let along = |change: &Change<'_>| {
+            let sweep = parts.sweeps.iter().find(|sweep| std::ptr::eq(&sweep.path, change.path));
+            sweep.map_or(&[][..], |sweep| &sweep.also[..])
+        };
+        let swept = combination.iter().flat_map(|(change, _)| {
+            let (value, also) = (change.value, along(change));
+            [*change].into_iter().chain(also.iter().map(move |path| Change { path, value }))
+        });
+        let changes = swept.chain(given.set.iter().map(CommandLine::change));
         let written = arg_paths.iter().zip(args).map(|(path, bind)| {
             let value = match &bind.value {
                 ast::BindValue::Expr(expr) => OverrideValue::Expr(expr),

@@ -226,6 +226,7 @@ fn named(item: &Item) -> Option<(Space, &Name)> {
         Item::Table(t) => (Space::Function, &t.name),
         Item::Interface(i) => (Space::Type, &i.name),
         Item::Model(m) => (Space::Type, &m.name),
+        Item::Variant(v) => (Space::Type, &v.name),
         Item::Device(d) => (Space::Type, &d.name),
         Item::Experiment(e) => (Space::Experiment, &e.name),
         Item::Fit(f) => (Space::Experiment, &f.name),

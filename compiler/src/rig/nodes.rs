@@ -530,7 +530,12 @@ fn described(
 
 fn bind(name: &str, span: Span, value: &Expr) -> ast::Bind {
     let whole = span.to(value.span);
-    ast::Bind { name: Name { text: name.into(), span }, value: ast::BindValue::Expr(value.clone()), span: whole }
+    ast::Bind {
+        name: Name { text: name.into(), span },
+        inner: None,
+        value: ast::BindValue::Expr(value.clone()),
+        span: whole,
+    }
 }
 
 fn number(value: f64, unit: Option<UnitText>, span: Span) -> Expr {

@@ -62,6 +62,7 @@ pub fn text(loaded: &Loaded, fit: &ast::Fit, fitted: &Fitted, asks: &Asks, place
             | Item::Table(_)
             | Item::Interface(_)
             | Item::Model(_)
+            | Item::Variant(_)
             | Item::Device(_)
             | Item::Rig(_) => own = true,
         }

@@ -4,27 +4,86 @@
 
 use super::*;
 
+/// A model that a name stands for.
+pub(super) struct Found<'a> {
+    pub(super) item: ItemRef,
+    pub(super) model: &'a ast::Model,
+    /// The variants on the way to it, with their files: the named one first.
+    variants: Vec<(FileId, &'a ast::Instance)>,
+    /// Whether one of them is the rotary twin.
+    pub(super) rotary: bool,
+}
+
+impl<'a> Found<'a> {
+    /// The arguments of an instance of it, in `env`, with those of its variants, and the changes of its parts. The
+    /// arguments of the instance take precedence.
+    fn with(&self, instance: &'a ast::Instance, env: &Env) -> (Vec<Arg<'a>>, Vec<Change<'a>>) {
+        let mut args = args_of(&instance.args, env);
+        let mut changes = changes_of(&instance.args, env);
+        for (file, variant) in &self.variants {
+            let given: Vec<&str> = args.iter().map(|arg| arg.name).collect();
+            let more = args_of(&variant.args, &Env::file(*file)).into_iter();
+            let more: Vec<Arg> = more.filter(|arg| !given.contains(&arg.name)).collect();
+            args.extend(more);
+            let mut all = changes_of(&variant.args, &Env::file(*file));
+            all.append(&mut changes);
+            changes = all;
+        }
+        (args, changes)
+    }
+}
+
 impl<'a> Flattener<'a> {
-    /// Instantiates the root as written in the text.
+    /// Instantiates the root as written in the text. `alone`: its inputs may stay open.
     pub(super) fn written(
         &mut self,
         instance: &'a ast::Instance,
         env: &Env,
         overrides: Vec<Change<'a>>,
+        alone: bool,
     ) -> Option<InstanceId> {
-        let (item, model) = self.model(env.file, &instance.model)?;
+        let found = self.model(env.file, &instance.model)?;
+        let (args, mut changes) = found.with(instance, env);
+        changes.extend(overrides);
         let made = Instantiation {
             path: String::new(),
-            rotary: instance.rotary,
+            rotary: instance.rotary || found.rotary,
             span: instance.model.span,
-            args: args_of(&instance.args, env),
-            overrides,
+            args,
+            overrides: changes,
         };
-        Some(self.instantiate(model, item.file, made, false))
+        Some(self.instantiate(found.model, found.item.file, made, alone))
     }
 
-    /// Finds the model of this name, or reports why not.
-    pub(super) fn model(&mut self, file: FileId, name: &Name) -> Option<(ItemRef, &'a ast::Model)> {
+    /// Finds the model of this name, or reports why not. The model of a variant is the one that it names, with its
+    /// arguments.
+    pub(super) fn model(&mut self, file: FileId, name: &Name) -> Option<Found<'a>> {
+        let (mut file, mut name, mut variants, mut rotary) = (file, name, Vec::new(), false);
+        let loaded = self.loaded;
+        loop {
+            let (item, variant) = match loaded.find(file, Space::Type, &name.text) {
+                Lookup::Found(item, Item::Variant(variant)) => (item, variant),
+                _ => {
+                    let (item, model) = self.written_model(file, name)?;
+                    return Some(Found { item, model, variants, rotary });
+                }
+            };
+            if variants.len() >= DEEPEST {
+                let error = Diagnostic::error("E0211", format!("{} is a variant of itself", variant.name.text))
+                    .recurring(Recurring::Part)
+                    .label(variant.name.span, "leads back to itself")
+                    .help("one of them names a model with equations");
+                self.report(error);
+                return None;
+            }
+            rotary |= variant.instance.rotary;
+            variants.push((item.file, &variant.instance));
+            (file, name) = (item.file, &variant.instance.model);
+        }
+    }
+
+    /// Finds the model of this name that has equations of its own, or reports why not.
+    fn written_model(&mut self, file: FileId, name: &Name) -> Option<(ItemRef, &'a ast::Model)> {
         let loaded = self.loaded;
         match loaded.find(file, Space::Type, &name.text) {
             Lookup::Found(item, Item::Model(model)) => return Some((item, model)),
@@ -58,7 +117,7 @@ impl<'a> Flattener<'a> {
     }
 
     pub(super) fn is_model(&self, file: FileId, name: &str) -> bool {
-        matches!(self.loaded.find(file, Space::Type, name), Lookup::Found(_, Item::Model(_)))
+        matches!(self.loaded.find(file, Space::Type, name), Lookup::Found(_, Item::Model(_) | Item::Variant(_)))
     }
 
     /// The library module that has an item of this name.
@@ -450,7 +509,11 @@ impl<'a> Flattener<'a> {
                 ArgValue::Expr(expr) => {
                     let word = self.loaded.files.slice(expr.span);
                     let model = self.loaded.find(arg.env.file, Space::Type, word);
-                    let model = if matches!(model, Lookup::Found(_, Item::Model(_))) { word } else { "Model" };
+                    let model = if matches!(model, Lookup::Found(_, Item::Model(_) | Item::Variant(_))) {
+                        word
+                    } else {
+                        "Model"
+                    };
                     let between = if model == word { "" } else { "…" };
                     let error = Diagnostic::error("E0205", format!("`{}` is a part: it takes a model", part.name.text))
                         .label(arg.span, if model == word { "a model is made by `()`" } else { "a value" })
@@ -461,7 +524,8 @@ impl<'a> Flattener<'a> {
         }
         changes.retain(|change| !change.path.is_empty());
         let (instance, instance_env) = chosen;
-        let (item, model) = self.model(instance_env.file, &instance.model)?;
+        let found = self.model(instance_env.file, &instance.model)?;
+        let (item, model) = (found.item, found.model);
         if self.models.len() >= DEEPEST && !self.models.contains(&item) {
             let error = Diagnostic::error("E0211", format!("parts are nested more than {DEEPEST} deep"))
                 .recurring(Recurring::Depth)
@@ -479,11 +543,13 @@ impl<'a> Flattener<'a> {
             return None;
         }
         let parent_rotary = self.system.instance(id).rotary;
-        let rotary = instance.rotary || instance_env.rotary;
+        let rotary = instance.rotary || instance_env.rotary || found.rotary;
         if self.full(part.repeat.as_ref().map_or(instance.model.span, |repeat| repeat.span)) {
             return None;
         }
-        let mut args = args_of(&instance.args, &instance_env);
+        let (mut args, mut inner) = found.with(instance, &instance_env);
+        inner.extend(changes);
+        let changes = inner;
         let mut fits = true;
         if let Some(slot) = &part.slot {
             let wiring = args_of(&part.instance.args, env);

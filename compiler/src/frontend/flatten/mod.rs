@@ -67,6 +67,8 @@ pub enum Instance<'a> {
     Alone(&'a ast::Model, FileId),
     /// A model on its own, whose inputs take their defaults.
     WithDefaults(&'a ast::Model, FileId),
+    /// A variant on its own, as a model is.
+    Variant(&'a ast::Instance, FileId),
 }
 
 /// A change from outside: `fr.Fs = 2 N`, `fr = LuGre()`.
@@ -126,7 +128,11 @@ pub fn flatten(loaded: &Loaded, sources: &dyn Sources, request: &Request) -> Fla
     match &request.instance {
         Instance::Written(instance, file) => {
             let env = Env::file(*file);
-            f.written(instance, &env, overrides);
+            f.written(instance, &env, overrides, false);
+        }
+        Instance::Variant(instance, file) => {
+            let env = Env::file(*file);
+            f.written(instance, &env, overrides, true);
         }
         Instance::Alone(model, file) | Instance::WithDefaults(model, file) => {
             let made = Instantiation {
@@ -162,7 +168,10 @@ pub fn flatten(loaded: &Loaded, sources: &dyn Sources, request: &Request) -> Fla
     let observed = match f.instances.first().map(|top| top.file) {
         Some(_) => {
             let file = match &request.instance {
-                Instance::Written(_, file) | Instance::Alone(_, file) | Instance::WithDefaults(_, file) => *file,
+                Instance::Written(_, file)
+                | Instance::Alone(_, file)
+                | Instance::WithDefaults(_, file)
+                | Instance::Variant(_, file) => *file,
             };
             let instance = framed.as_ref().map_or(InstanceId(0), |framed| framed.rig);
             let env = Env { instance: Some(instance), outside: true, ..Env::file(file) };
@@ -515,7 +524,23 @@ fn args_of<'a>(args: &'a [ast::Bind], env: &Env) -> Vec<Arg<'a>> {
         env: env.clone(),
         overriding: false,
     };
-    args.iter().map(arg).collect()
+    args.iter().filter(|bind| bind.inner.is_none()).map(arg).collect()
+}
+
+/// The arguments of an instance that go into its parts, `ctl.Kx = 10 1/s`, as changes.
+fn changes_of<'a>(args: &'a [ast::Bind], env: &Env) -> Vec<Change<'a>> {
+    let change = |bind: &'a ast::Bind| {
+        Some(Change {
+            path: &bind.inner.as_ref()?.segments,
+            span: bind.span,
+            value: match &bind.value {
+                ast::BindValue::Expr(expr) => OverrideValue::Expr(expr),
+                ast::BindValue::Instance(instance) => OverrideValue::Instance(instance),
+            },
+            env: env.clone(),
+        })
+    };
+    args.iter().filter_map(change).collect()
 }
 
 /// All declarations of a model, including those inside `every`.
