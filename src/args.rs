@@ -470,6 +470,9 @@ pub struct Linearise {
     /// Time; of an experiment: where its run is then [default: the start]
     #[arg(long, value_name = "TIME", value_parser = positive_time)]
     pub time: Option<f64>,
+    /// Where everything has come to rest, in place of --time
+    #[arg(long, conflicts_with = "time")]
+    pub rest: bool,
     /// Inputs, also of parts [default: those of the whole]
     #[arg(long, value_name = "PATH,…", value_delimiter = ',')]
     pub inputs: Vec<String>,
@@ -479,6 +482,22 @@ pub struct Linearise {
     /// Parameters: P and Q are the derivatives of rates and outputs with respect to them
     #[arg(long, value_name = "PATH,…", value_delimiter = ',')]
     pub params: Vec<String>,
+    /// Break the loop at this output of a controller, such as ctl.u: the matrices of the open loop through its sampled
+    /// code and the hold, and the margins of the closed loop
+    #[arg(long = "loop", value_name = "PATH", conflicts_with_all = ["inputs", "outputs", "params"])]
+    pub broken: Option<String>,
+    /// Print the margins of the loop alone, without its matrices
+    #[arg(long, requires = "broken")]
+    pub margins: bool,
+    /// Draw gain and phase of the loop (.svg, .png, .pdf), or write them (.csv)
+    #[arg(long, value_name = "FILE", requires = "broken", value_hint = ValueHint::FilePath, value_parser = bode)]
+    pub bode: Option<PathBuf>,
+    /// Time that the controller takes, from reading its inputs until its output acts
+    #[arg(long, value_name = "TIME", requires = "broken", value_parser = positive_time)]
+    pub delay: Option<f64>,
+    /// How the diagram of --bode is drawn
+    #[command(flatten)]
+    pub look: Look,
     /// Changes to the text
     #[command(flatten)]
     pub set: Set,
@@ -1191,6 +1210,15 @@ fn picture(text: &str) -> Result<PathBuf, String> {
         Some("svg" | "png" | "pdf") => Ok(path),
         None if text == "-" => Ok(path),
         _ => Err("the name of a plot ends in .svg, .png or .pdf".into()),
+    }
+}
+
+/// A name of a Bode diagram.
+fn bode(text: &str) -> Result<PathBuf, String> {
+    let path = PathBuf::from(text);
+    match path.extension().and_then(|extension| extension.to_str()) {
+        Some("svg" | "png" | "pdf" | "csv") => Ok(path),
+        _ => Err("the name of a Bode diagram ends in .svg, .png, .pdf, or .csv for its numbers".into()),
     }
 }
 

@@ -239,9 +239,19 @@ pub fn linear(
         }
         let (code, _) = code(&functions, &variant.program.description, options.interpret);
         let instance = Instance::new(Arc::new(variant.program.description.clone()), code, &variant.program.params);
+        let instance = match &variant.adaptive {
+            Some(program) => {
+                let code = codegen::tiering::on_demand(program, Method::Adaptive, options.interpret);
+                let adaptive = Instance::new(Arc::new(program.description.clone()), code, &program.params);
+                instance.with_adaptive(Arc::new(adaptive))
+            }
+            None => instance,
+        };
         let params = options.changes.ports.as_ref().map_or(&[][..], |ports| &ports.params);
         let experiment = Some(variant.experiment);
-        return Ok(analysis::linearise::Linear::new(&variant.program, instance, experiment, &variant.ports, params));
+        let linear = analysis::linearise::Linear::new(&variant.program, instance, experiment, &variant.ports, params);
+        let broken = options.changes.ports.as_ref().is_some_and(|ports| ports.broken.is_some());
+        return Ok(if broken { linear.breaking(&variant.program) } else { linear });
     };
     let given = experiment::overrides(loaded, &options.changes, warnings);
     let overrides = given.iter().map(|change| change.override_in(root)).collect();
@@ -263,7 +273,8 @@ pub fn linear(
     let slots = (inputs.collect(), outputs.collect());
     let (code, _) = code(&functions(&program, Method::Adaptive), &program.description, true);
     let instance = Instance::new(Arc::new(program.description.clone()), code, &program.params);
-    Ok(analysis::linearise::Linear::new(&program, instance, None, &slots, &ports.params))
+    let linear = analysis::linearise::Linear::new(&program, instance, None, &slots, &ports.params);
+    Ok(if ports.broken.is_some() { linear.breaking(&program) } else { linear })
 }
 
 /// A rig, ready to run.

@@ -1,5 +1,7 @@
 //! `fric linearise`: the matrices A, B, C, D at an operating point and the modes of A; P and Q, the derivatives of
-//! rates and outputs by parameters.
+//! rates and outputs by parameters. With `--loop`, the loop broken at a signal and its margins.
+
+mod broken_loop;
 
 use super::{End, load, reported};
 use crate::args::Linearise;
@@ -13,13 +15,18 @@ use abi::Slot;
 use abi::description::{Kind, Quantity};
 use abi::unit::Unit;
 use runtime::coupling::eigenvalues::{Mode, modes};
-use runtime::engine::{self, Continue};
+use runtime::engine::{self, Continue, equilibrium};
 use serde_json::{Value, json};
 use std::f64::consts::TAU;
 
 pub fn linearise(args: &Linearise, terminal: &mut Terminal) -> End {
     let Some(mut loaded) = load(&args.file, terminal, &mut Stopwatch::start("read")) else { return End::Failed };
-    let ports = Ports { inputs: args.inputs.clone(), outputs: args.outputs.clone(), params: args.params.clone() };
+    let ports = Ports {
+        inputs: args.inputs.clone(),
+        outputs: args.outputs.clone(),
+        params: args.params.clone(),
+        broken: args.broken.clone(),
+    };
     let changes = Changes { ports: Some(ports), ..args.set.changes() };
     let options = Options { changes, ..Options::default() };
     let mut linear = match compile::linear(&mut loaded, &crate::disk::Disk, &args.name, &options, &mut Vec::new()) {
@@ -39,6 +46,15 @@ pub fn linearise(args: &Linearise, terminal: &mut Terminal) -> End {
     if let Err(message) = go_to_point(&mut linear, args) {
         terminal.error(&message);
         return End::Failed;
+    }
+    if let Some(path) = &args.broken {
+        return match broken_loop::broken_loop(&mut linear, path, args, terminal) {
+            Ok(()) => End::Fine,
+            Err(message) => {
+                terminal.error(&message);
+                End::Failed
+            }
+        };
     }
     let found = linear.at();
     let all = [&found.a, &found.b, &found.c, &found.d, &found.p, &found.q];
@@ -120,8 +136,31 @@ fn go_to_point(linear: &mut Linear, args: &Linearise) -> Result<(), String> {
             linear.instance.set(Slot::TIME, time.unwrap_or(0.0));
         }
     }
+    if args.rest {
+        come_to_rest(linear)?;
+    }
     for (slot, value) in later {
         linear.instance.set(slot, value);
+    }
+    Ok(())
+}
+
+/// Relative tolerance of the search for rest.
+const REST_TOL: f64 = 1e-9;
+
+/// Moves the instance, which has started, to where nothing moves any more.
+fn come_to_rest(linear: &mut Linear) -> Result<(), String> {
+    let mut from = linear.instance.adaptive().unwrap_or_else(|| linear.instance.clone());
+    from.start(0.0);
+    let go_on = &mut |_| Continue::Continue(());
+    let rested = equilibrium::settle(from, REST_TOL, go_on).map_err(|restless| {
+        format!("{} {restless}; give another point with --at or --time", linear.instance.description().name)
+    })?;
+    let layout = &linear.instance.description().layout;
+    let kept = [layout.states, layout.memory, layout.regimes];
+    let slots: Vec<Slot> = kept.iter().flat_map(|segment| segment.range()).map(|slot| Slot(slot as u32)).collect();
+    for slot in slots.into_iter().chain([Slot::TIME]) {
+        linear.instance.set(slot, rested.get(slot));
     }
     Ok(())
 }

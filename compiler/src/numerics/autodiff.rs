@@ -25,6 +25,18 @@ pub fn inline(build: &Shared, func: &Func, env: &mut Env, directions: &[Slot]) -
     inline_given(build, func, env, directions, &HashMap::default())
 }
 
+/// Like [`inline`], but a staircase counts as the line through it: the derivative of floor and of rounding is 1, so an
+/// encoder passes on how its position moves. `met`: set if such a derivative was taken.
+pub fn inline_smoothed(
+    build: &Shared,
+    func: &Func,
+    env: &mut Env,
+    directions: &[Slot],
+    met: &mut bool,
+) -> HashMap<Slot, Gradient> {
+    differentiate(build, func, env, directions, &HashMap::default(), Some(met))
+}
+
 /// Like [`inline`], but the values of `func` in `given` are replaced and count as constant.
 pub fn inline_given(
     build: &Shared,
@@ -32,6 +44,18 @@ pub fn inline_given(
     env: &mut Env,
     directions: &[Slot],
     given: &HashMap<Value, Value>,
+) -> HashMap<Slot, Gradient> {
+    differentiate(build, func, env, directions, given, None)
+}
+
+/// `smoothed`: staircases have the derivative 1 if it is given; it tells whether there was one.
+fn differentiate(
+    build: &Shared,
+    func: &Func,
+    env: &mut Env,
+    directions: &[Slot],
+    given: &HashMap<Value, Value>,
+    mut smoothed: Option<&mut bool>,
 ) -> HashMap<Slot, Gradient> {
     let direction: HashMap<Slot, u32> = directions.iter().enumerate().map(|(k, slot)| (*slot, k as u32)).collect();
     let live = func.live();
@@ -58,7 +82,13 @@ pub fn inline_given(
             func.ops[i].each_operand(|operand| operands.push(operand));
             &gradients[operands[k].index()]
         };
-        gradients[i] = gradient(build, op, values[i], &of);
+        gradients[i] = match (&mut smoothed, op) {
+            (Some(met), Op::Floor(_) | Op::Nearest(_)) => {
+                **met |= !of(0).is_empty();
+                of(0).clone()
+            }
+            _ => gradient(build, op, values[i], &of),
+        };
         // Frees gradients that have no further use: on a sum over a thousand parts, they would have half a million
         // entries.
         func.ops[i].each_operand(|operand| {

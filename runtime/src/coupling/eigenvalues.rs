@@ -43,8 +43,17 @@ pub fn modes(n: usize, a: &[f64]) -> Option<Vec<Mode>> {
     let size = scaled.iter().fold(0.0f64, |size, entry| size.max(entry.abs()));
     let matrix = DMatrix::from_row_slice(n, n, &scaled);
     // Values below the rounding error of the largest entries are noise of the reduction.
-    let schur = Schur::try_new(matrix, f64::EPSILON, 10_000)?;
-    let eigenvalues: Vec<Complex<f64>> = schur.complex_eigenvalues().iter().copied().collect();
+    let found = |matrix: DMatrix<f64>| {
+        let schur = Schur::try_new(matrix, f64::EPSILON, 10_000)?;
+        Some(schur.complex_eigenvalues().iter().copied().collect::<Vec<Complex<f64>>>())
+    };
+    // Of a nilpotent part, such as a shift register, no entry is small against the diagonal, which is 0: shift it.
+    let shifted = || {
+        let shift = if size > 0.0 { size } else { 1.0 };
+        let all = found(&matrix + DMatrix::identity(n, n) * shift)?;
+        Some(all.into_iter().map(|value| value - shift).collect())
+    };
+    let eigenvalues: Vec<Complex<f64>> = found(matrix.clone()).or_else(shifted)?;
     let noise = 1e-15 * size;
     let clean = |x: f64| if x.abs() <= noise { 0.0 } else { x };
     let mut modes: Vec<Mode> = eigenvalues
@@ -107,6 +116,22 @@ mod tests {
         assert_eq!(found[0], Mode { real: 0.0, imaginary: 0.0 });
         assert_eq!(found[0].damping(), None);
         assert!((found[1].real / -1e8 - 1.0).abs() < 1e-12 && found[1].damping() == Some(1.0));
+    }
+
+    /// A shift register of growing length, alone and in a loop that is read at its end.
+    #[test]
+    fn a_shift_register_has_eigenvalues() {
+        for n in 1..14 {
+            let mut register = vec![0.0; n * n];
+            (1..n).for_each(|k| register[k * n + k - 1] = 1.0);
+            let found = modes(n, &register).unwrap();
+            assert!(found.iter().all(|mode| mode.frequency() < 1e-1), "{n}: {found:?}");
+            // zⁿ = 1/2
+            register[n - 1] += 0.5;
+            let found = modes(n, &register).unwrap();
+            let size = 0.5f64.powf(1.0 / n as f64);
+            assert!(found.iter().all(|mode| (mode.frequency() - size).abs() < 1e-9), "{n}: {found:?}");
+        }
     }
 
     #[test]

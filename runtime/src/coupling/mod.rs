@@ -10,3 +10,4 @@ pub(crate) mod sil;
 pub mod eigenvalues;
 pub mod passivity;
 pub mod loop_stability;
+pub mod open_loop;
