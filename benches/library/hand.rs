@@ -28,6 +28,10 @@ pub const LEFT_OUT: &[(&str, &str)] = &[
     ("TrackingServo", "a whole closed loop"),
     ("Pull", "a whole closed loop"),
     ("Hold", "a whole closed loop"),
+    ("Trapezoid", "a function of time alone, which C here does not get"),
+    ("SCurve", "a function of time alone, which C here does not get"),
+    ("LowPass", "two coupled states and constant coefficients, like SpeedObserver"),
+    ("Notch", "two coupled states and constant coefficients, like SpeedObserver"),
 ];
 
 /// The step length at which a model is called, s: a sampled one at its own rate.

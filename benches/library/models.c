@@ -760,6 +760,15 @@ static void SampleHold(ARGS) {
         x[1] = u[0];
     o[0] = x[1];
 }
+static void RateLimiter(ARGS) {
+    x[1] += 1; /* last count y */
+    if (due(x[1], p[2], h)) {
+        double low = -p[1] * p[2], high = p[0] * p[2], d = u[0] - x[0];
+        x[2] = x[0] + (d < low ? low : d > high ? high : d);
+        x[0] = x[2];
+    }
+    o[0] = x[2];
+}
 static void UnitDelay(ARGS) {
     x[1] += 1; /* last count y */
     if (due(x[1], p[0], h)) {
@@ -1077,6 +1086,7 @@ static void TwoMass(ARGS) {
     MODEL(Lag, 0x1u, 0, "u", "T", "y", "") \
     MODEL(KFMClip, 0x6u, 1, "v F_ext", "Fc Fs Fv m h v_rest", "@count rests F", "F") \
     MODEL(SampleHold, 0x2u, 1, "u", "Ts", "@count y", "y") \
+    MODEL(RateLimiter, 0x5u, 1, "u", "up down Ts", "last @count y", "y") \
     MODEL(UnitDelay, 0x5u, 1, "u", "Ts", "last @count y", "y") \
     MODEL(DisturbanceObserver, 0x1u, 1, "v u", "m T", "q", "F_hat") \
     MODEL(DisturbanceObserver2, 0x3u, 1, "v u", "m T", "q f", "F_hat") \

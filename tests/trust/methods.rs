@@ -64,6 +64,11 @@ const BENCHES: &[Bench] = &[
     bench("Encoder(x = PLACE)", "y"),
     bench("SampleHold(u = PLACE)", "y"),
     bench("UnitDelay(u = PLACE)", "y"),
+    bench("RateLimiter(u = PLACE)", "y"),
+    bench("Trapezoid(x1 = 10 mm)", "x"),
+    bench("SCurve(x1 = 10 mm)", "x"),
+    bench("LowPass(u = PLACE, f = 30 Hz)", "y"),
+    bench("Notch(u = FORCE, f = 30 Hz)", "y"),
     bench("PIDDiscrete(r = PLACE, y = 0 m)", "u"),
     bench("CascadeDiscrete(r = PLACE, y = 0 m)", "u"),
     bench("FeedForward(v_d = SPEED)", "u"),
@@ -190,6 +195,7 @@ const SAMPLED: &[&str] = &[
     "KFMClip",
     "Knocker",
     "PIDDiscrete",
+    "RateLimiter",
     "SampleHold",
     "UnitDelay",
 ];
@@ -241,7 +247,7 @@ impl<'a> Case<'a> {
 fn course(case: &Case, method: &str, parts: u32) -> Result<Vec<f64>, String> {
     let step = case.step / f64::from(parts);
     let text = format!(
-        "import std.interfaces import std.friction import std.control import std.plant import std.observer import std.bench
+        "import std.interfaces import std.friction import std.control import std.signal import std.plant import std.observer import std.bench
 experiment it {{ run {} for 1 s  solver {method} step {} us }}",
         case.run,
         step * 1e6
