@@ -861,6 +861,13 @@ fn check_model(loaded: &Loaded, sources: &dyn Sources, model: &grammar::ast::Mod
     let (system, types, mut diagnostics) = alone(loaded, sources, (model, file), Vec::new(), depth);
     if whole && !diagnostics.iter().any(Diagnostic::is_error) {
         diagnostics.extend(analysis::lints::check(&system, &types, &loaded.files, physics));
+        if let Some((opened, contacts)) = analysis::pushes::open(&system, &types).filter(|_| physics) {
+            let mut found = Vec::new();
+            let types = analyse(&opened, &loaded.files, Depth::Causality, &Diagnostic::is_error, &mut found);
+            if !found.iter().any(Diagnostic::is_error) {
+                diagnostics.extend(analysis::pushes::check(&opened, &types, &contacts));
+            }
+        }
     }
     diagnostics.extend(with_defaults(loaded, sources, model));
     if loaded.misread(model.span) {

@@ -14,3 +14,4 @@ pub mod lints;
 pub mod explain;
 pub mod step_stability_report;
 pub mod linearise;
+pub mod pushes;

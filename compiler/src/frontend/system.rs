@@ -474,6 +474,7 @@ pub const LINTS: &[(&str, &str)] = &[
     ("not-dissipative", "W0703"),
     ("large-step", "W0704"),
     ("chatter", "W0705"),
+    ("pushes", "W0706"),
     ("emulation-limit", "W0801"),
     ("coarse-encoder", "W0802"),
     ("coarse-speed", "W0803"),
