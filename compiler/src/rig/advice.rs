@@ -6,6 +6,7 @@
 
 use super::RigSpans;
 use crate::analysis::linearise::{Linear, Matrices, PortSlots};
+use crate::frontend::system::{Definition, ExprId, Node, System, Var, VarId, VarKind};
 use crate::ir::interpret::Interpreter;
 use crate::ir::program::Program;
 use abi::description::{Kind as QuantityKind, Quantity};
@@ -54,11 +55,11 @@ pub fn inertia(rig: &Rig, plant: &Program) -> Option<f64> {
     (gain != 0.0 && gain.is_finite()).then(|| 1.0 / gain.abs())
 }
 
-/// All warnings of a rig.
-pub fn check(rig: &Rig, control: &Program, plant: &Program, places: &RigSpans) -> Vec<Diagnostic> {
+/// All warnings of a rig. `system`: that of the control program.
+pub fn check(rig: &Rig, system: &System, control: &Program, plant: &Program, places: &RigSpans) -> Vec<Diagnostic> {
     let mut found = Vec::new();
     emulation(rig, control, plant, places, &mut found);
-    resolution(rig, control, places, &mut found);
+    resolution(rig, system, control, places, &mut found);
     unproven(rig, places, &mut found);
     found
 }
@@ -212,12 +213,12 @@ fn contact(
     Some(ContactResponse { stiffness: sign * stiffness, damping: sign * damping })
 }
 
-fn resolution(rig: &Rig, control: &Program, places: &RigSpans, found: &mut Vec<Diagnostic>) {
+fn resolution(rig: &Rig, system: &System, control: &Program, places: &RigSpans, found: &mut Vec<Diagnostic>) {
     let quantities = &control.description.quantities;
     let shown = |value: f64, unit: &Unit| quantity(value, unit, 3);
     let used = |what: SignalKind, node: usize| rig.inputs.iter().any(|input| input.signal == Signal { node, what });
-    let params = |dimension: Dimension, angular: bool| {
-        let all = quantities.iter().filter(move |q| {
+    let params = |dimension: Dimension, angular: bool, compared: &dyn Fn(&str) -> bool| {
+        let all = quantities.iter().filter(|q| compared(&q.path)).filter(move |q| {
             let plain = !q.unit.text.contains("/rad");
             let fits = if angular { q.unit.angle == Angle::Angle } else { plain };
             q.kind == QuantityKind::Param && q.unit.dimension == dimension && fits
@@ -248,7 +249,16 @@ fn resolution(rig: &Rig, control: &Program, places: &RigSpans, found: &mut Vec<D
                 format!("a count of at most {} shows it; or observe the shaft with a `part`", shown(most, &state.unit));
             found.push(warning.help(help));
         }
-        if let Some((param, value)) = params(SPEED, true).filter(|_| used(SignalKind::Speed, k))
+        // A parameter of a law that is fed with a planned speed is not compared with the measured one.
+        let speeds: Vec<&str> = rig
+            .inputs
+            .iter()
+            .filter(|input| input.signal == Signal { node: k, what: SignalKind::Speed })
+            .filter_map(|input| quantities.iter().find(|q| q.slot == input.slot))
+            .map(|quantity| quantity.path.as_str())
+            .collect();
+        let compared = |path: &str| is_fed(system, path, &speeds);
+        if let Some((param, value)) = params(SPEED, true, &compared).filter(|_| used(SignalKind::Speed, k))
             && drive.speed_unit > SPEED_SHARE * value
         {
             let message = format!("the speed of `{}` is too coarse for `{}`", node.name, param.path);
@@ -261,7 +271,7 @@ fn resolution(rig: &Rig, control: &Program, places: &RigSpans, found: &mut Vec<D
             found.push(warning.help(help));
         }
         let commanded = rig.outputs.iter().any(|output| output.signal == Signal { node: k, what: SignalKind::Torque });
-        if let Some((param, value)) = params(TORQUE, false).filter(|_| commanded)
+        if let Some((param, value)) = params(TORQUE, false, &|_| true).filter(|_| commanded)
             && 1e-3 * drive.rated_torque > TORQUE_SHARE * value
         {
             let message = format!("the torque of `{}` is too coarse for `{}`", node.name, param.path);
@@ -273,4 +283,35 @@ fn resolution(rig: &Rig, control: &Program, places: &RigSpans, found: &mut Vec<D
             found.push(warning.help(help));
         }
     }
+}
+
+/// Whether one of the sources reaches an input of the model to which a parameter belongs; true for the root, whose
+/// equations may compare anything.
+fn is_fed(system: &System, param: &str, sources: &[&str]) -> bool {
+    let Some((owner, _)) = param.rsplit_once('.') else { return true };
+    let inside = |var: &Var| var.kind == VarKind::Input && var.path.rsplit_once('.').is_some_and(|(of, _)| of == owner);
+    let mut stack: Vec<VarId> = system.var_ids().filter(|id| inside(system.var(*id))).collect();
+    let mut seen = vec![false; system.vars.len()];
+    while let Some(id) = stack.pop() {
+        if std::mem::replace(&mut seen[id.0 as usize], true) {
+            continue;
+        }
+        let var = system.var(id);
+        if sources.contains(&var.path.as_str()) {
+            return true;
+        }
+        let mut nodes: Vec<ExprId> = match &var.definition {
+            Definition::Missing | Definition::Free => Vec::new(),
+            Definition::Value(value, _) | Definition::Held { value, .. } => vec![*value],
+            Definition::Sampled { initial, next, .. } => vec![*initial, *next],
+            Definition::Continuous { initial, rate, .. } => vec![*initial, *rate],
+        };
+        while let Some(node) = nodes.pop() {
+            match system.node(node) {
+                Node::Var(of) | Node::Rate(of) | Node::PathRate(of) => stack.push(*of),
+                other => nodes.extend(other.operands()),
+            }
+        }
+    }
+    false
 }

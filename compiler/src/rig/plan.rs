@@ -590,7 +590,7 @@ impl PartitionedRig {
 
     /// Warnings about the rig, except those that it allows.
     pub fn advice(&self, rig: &Rig, control: &Program, plant: &Program) -> Vec<Diagnostic> {
-        let mut found = advice::check(rig, control, plant, &self.places);
+        let mut found = advice::check(rig, &self.control, control, plant, &self.places);
         found.retain(|warning| !self.allowed(warning));
         found
     }
