@@ -414,10 +414,16 @@ pub struct Sweep {
     pub interpret: bool,
 }
 
+/// Probability with which an interval of a fit holds the true value, if none is given.
+pub const LEVEL: f64 = 0.95;
+/// Number of starts of a fit, if none is given.
+pub const STARTS: usize = 64;
+
 /// `fric fit`
 #[derive(clap::Args, Debug)]
 pub struct Fit {
-    /// The text
+    /// The text; or a recording alone, such as bench.csv with the heading `t [s],v [mm/s],F [N]`: then the standard laws
+    /// are fitted and ranked
     #[arg(value_hint = ValueHint::FilePath)]
     pub file: PathBuf,
     /// The fits in it to find the parameters of [default: all]
@@ -429,6 +435,12 @@ pub struct Fit {
     /// Probability with which an interval holds the true value
     #[arg(long, value_name = "PERCENT", default_value = "95%", value_parser = level)]
     pub level: f64,
+    /// Number of starts that are judged: the one in the text, and others all over the ranges
+    #[arg(long, value_name = "N", default_value_t = STARTS, value_parser = starts)]
+    pub starts: usize,
+    /// Seed of the other starts
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    pub seed: u64,
     /// Judge the values as they are written, and search for nothing
     #[arg(long)]
     pub check: bool,
@@ -1135,6 +1147,13 @@ fn tolerance(text: &str) -> Result<f64, String> {
     match text.parse::<f64>() {
         Ok(tol) if tol > 0.0 && tol < 1.0 => Ok(tol),
         _ => Err("a number between 0 and 1 is needed, for example 1e-8".into()),
+    }
+}
+
+fn starts(text: &str) -> Result<usize, String> {
+    match text.parse() {
+        Ok(starts) if (1..=100_000).contains(&starts) => Ok(starts),
+        _ => Err("a number from 1 to 100000 is needed".into()),
     }
 }
 

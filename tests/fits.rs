@@ -200,7 +200,7 @@ fn what_data_do_not_determine_is_said() {
 
 #[test]
 fn a_start_that_cannot_be_run_is_named() {
-    let text = "model M { input v [m/s]  param p = 1  in 0.1 .. 10  state x [1] = 0.5 in 0 .. 1  dx/dt = p * v / 1 m  output F [N] = x * 1 N }\nfit f {\n  run M(v = data.v)\n  data \"r.csv\" (t [s], v [m/s], F [N])\n  vary p = 9 in 0.1 .. 10\n  minimise rms(F - data.F)\n}\n";
+    let text = "model M { input v [m/s]  param p = 1  in 0.1 .. 10  state x [1] = 0.5 in 0 .. 1  dx/dt = p * v / 1 m  output F [N] = x * 1 N }\nfit f {\n  run M(v = data.v)\n  data \"r.csv\" (t [s], v [m/s], F [N])\n  vary p = 9 in 1 .. 10\n  minimise rms(F - data.F)\n}\n";
     let data: String = (0..20).map(|k| format!("{},1,0.5\n", 0.1 * f64::from(k))).collect();
     let (start, code) = said("start", text, &data, &[]);
     assert!(start.contains("E0907") && start.contains("`x` leaves its range") && start.contains("p = 9"), "{start}");
@@ -323,6 +323,111 @@ fn a_model_that_does_not_settle_is_named() {
     let text = "model Swing {\n  input v [m/s]\n  param k = 1 N/m  in 0.1 N/m .. 10 N/m\n  state x [m] = 0\n  state w [m/s] = 0\n  dx/dt = v - w\n  dw/dt = k * x / 1e6 kg\n  output F [N] = k * x + v * 1 N·s/m\n}\nfit f {\n  run Swing(v = data.v)\n  data \"r.csv\" (v [m/s], F [N])\n  vary k\n  minimise rms(F - data.F)\n  solver adaptive tol 1e-4\n}\n";
     let (swing, _) = said("swing", text, "1,1\n2,2\n3,3\n", &[]);
     assert!(swing.contains("W0911") && swing.contains("does not settle at 3 of 3 steady points"), "{swing}");
+}
+
+/// `fric fit r.csv --json`: an object for each law, the best first.
+fn laws_of(name: &str, data: &str) -> Vec<Value> {
+    let folder = folder(name);
+    fs::write(folder.join("r.csv"), data).unwrap();
+    let output = fric(&folder, &["fit", "r.csv", "--json"]);
+    let text = String::from_utf8_lossy(&output.stdout);
+    assert!(output.status.success(), "{name}: {output:?}");
+    text.lines().map(|line| serde_json::from_str(line).unwrap()).collect()
+}
+
+/// A value of the parameter of a law in SI.
+fn value(law: &Value, path: &str, what: &str) -> f64 {
+    let all = law["parameters"].as_array().unwrap();
+    let one = all.iter().find(|one| one["path"] == path).unwrap_or_else(|| panic!("{path}: {law}"));
+    let scale = if one["unit"] == "mm/s" { 1e-3 } else { 1.0 };
+    scale * one[what].as_f64().unwrap()
+}
+
+/// A recording alone names its law, with its values, whatever its units, and whether speed or position was measured.
+#[test]
+fn a_recording_alone_ranks_the_laws() {
+    let rows = moved();
+    let mut chance = Chance(3);
+    let noisy: Vec<(f64, f64, f64)> = rows.iter().map(|(t, v, f)| (*t, *v, f + 5e-3 * chance.normal())).collect();
+    let lines = |line: &dyn Fn(&(f64, f64, f64)) -> String| noisy.iter().map(line).collect::<String>();
+    let speeds = "t [s],v [m/s],F [N]\n".to_string() + &lines(&|(t, v, f)| format!("{t:.4},{v:e},{f:e}\n"));
+    let named = laws_of("law-v", &speeds);
+    let models: Vec<&str> = named.iter().map(|law| law["model"].as_str().unwrap()).collect();
+    assert_eq!((models[0], models.len()), ("LuGre", 8), "{models:?}");
+    for (path, _, expected) in CONTACT {
+        let (at, sd) = (value(&named[0], path, "value"), value(&named[0], path, "sd"));
+        assert!((at - expected).abs() < 4.0 * sd, "{path}: {at} ± {sd}, not {expected}");
+    }
+    let held_out: Vec<f64> = named[..2].iter().map(|law| law["held_out_rms"].as_f64().unwrap()).collect();
+    assert!((held_out[0] / 5e-3 - 1.0).abs() < 0.05 && held_out[1] > 10.0 * held_out[0], "{held_out:?}");
+    // In other units, with another column and in another order.
+    let other = "F [mN];_;v [mm/s];t [ms]\n".to_string()
+        + &lines(&|(t, v, f)| format!("{:e};0;{:e};{:.1}\n", 1e3 * f, 1e3 * v, 1e3 * t));
+    let other = laws_of("law-units", &other);
+    assert_eq!(other.iter().map(|law| law["model"].as_str().unwrap()).collect::<Vec<_>>(), models);
+    for (path, _, _) in CONTACT {
+        let [a, b] = [&named, &other].map(|laws| value(&laws[0], path, "value"));
+        assert!((a / b - 1.0).abs() < 1e-6, "{path}: {a}, {b}");
+    }
+    let mut x = 0.0;
+    let mut positions = "t [s],x [m],F [N]\n".to_string();
+    for (k, (t, v, f)) in noisy.iter().enumerate() {
+        x += if k > 0 { 0.5e-3 * (v + noisy[k - 1].1) } else { 0.0 };
+        positions += &format!("{t:.4},{x:.17e},{f:e}\n");
+    }
+    let positions = laws_of("law-x", &positions);
+    assert_eq!(positions[0]["model"], "LuGre", "{}", positions[0]);
+    assert!((value(&positions[0], "Fc", "value") - 1.0).abs() < 0.01, "{}", positions[0]);
+}
+
+/// The text that is written fits each law again, with the same answer.
+#[test]
+fn a_curve_alone_ranks_static_laws_and_writes_their_fits() {
+    for seed in 0..3 {
+        let rows: String = curve(&mut Chance(seed)).concat();
+        let laws = laws_of("law-curve", &format!("v [m/s],F [N]\n{rows}"));
+        let rank = |model: &str| laws.iter().find(|law| law["model"] == model).unwrap()["rank"].as_u64().unwrap();
+        assert!(laws.len() == 5 && rank("StribeckGauss") == 1 && rank("Coulomb") > 1, "seed {seed}: {laws:?}");
+        let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).join("fits/law-curve");
+        let output = fric(&folder, &["fit", "r.csv"]);
+        let words = String::from_utf8_lossy(&output.stdout);
+        assert!(words.contains("held out") && words.contains("wrote out/r_laws.fric"), "{output:?}");
+        assert!(fric(&folder, &["fmt", "--check", "out/r_laws.fric"]).status.success());
+        let again = fric(&folder, &["fit", "out/r_laws.fric", "stribeckgauss", "--json"]);
+        let again: Value = serde_json::from_slice(&again.stdout).unwrap();
+        let first = laws.iter().find(|law| law["model"] == "StribeckGauss").unwrap();
+        assert_eq!(again["parameters"], first["parameters"], "seed {seed}");
+    }
+}
+
+/// What a recording lacks is said with what to write.
+#[test]
+fn a_recording_that_no_law_can_be_fitted_to_is_refused() {
+    let rows: String = (0..30).map(|k| format!("{},{},1\n", 0.1 * f64::from(k), f64::from(k % 7) - 3.0)).collect();
+    let still: String = (0..30).map(|k| format!("{},0,1\n", 0.1 * f64::from(k))).collect();
+    let cases = [
+        ("a,b,c\n", &rows, "its heading has neither t, v, F"),
+        ("", &rows, "its heading has neither t, v, F"),
+        ("t,v,F\n", &rows, "states no unit of `t`: write `t [s]`"),
+        ("t [s],v [m],F [N]\n", &rows, "its column `v` is in m"),
+        ("t [s],v [m/s],F [N]\n", &still, "nothing moves in it"),
+        (
+            "t [s],v [m/s],F [N]\n",
+            &rows.lines().take(4).map(|row| row.to_string() + "\n").collect::<String>(),
+            "it has 4 rows",
+        ),
+        ("t [s],v [m/s],F [N]\n", &rows.replace("-3,1", "-3x,1"), "line 2"),
+    ];
+    for (k, (heading, rows, expected)) in cases.into_iter().enumerate() {
+        let folder = folder("law-refused");
+        fs::write(folder.join("r.csv"), format!("{heading}{rows}")).unwrap();
+        let output = fric(&folder, &["fit", "r.csv"]);
+        let text = String::from_utf8_lossy(&output.stderr);
+        assert!(text.contains(expected) && output.status.code() == Some(1), "case {k}: {text}");
+    }
+    let folder = folder("law-misused");
+    fs::write(folder.join("r.csv"), "t [s],v [m/s],F [N]\n").unwrap();
+    assert_eq!(fric(&folder, &["fit", "r.csv", "--check"]).status.code(), Some(2));
 }
 
 /// The text that a fit has written is in canonical layout, and its experiment passes.

@@ -1,4 +1,4 @@
-//! `fric test`: runs every experiment that has expectations.
+//! `fric test`: runs every experiment and does every fit that has expectations.
 
 use super::{End, compiled, done, load};
 use crate::args::Test;
@@ -10,6 +10,7 @@ use crate::results;
 use crate::terminal::{Style, Terminal};
 use crate::timings::Timings;
 use std::path::PathBuf;
+use std::time::Instant;
 
 pub fn test(args: &Test, timings: &mut Timings, terminal: &mut Terminal) -> End {
     let mut tally = Tally::default();
@@ -41,15 +42,21 @@ pub fn test(args: &Test, timings: &mut Timings, terminal: &mut Terminal) -> End 
         timings.add_all(&stages);
         let names: Vec<String> =
             loaded.experiments().into_iter().filter(|info| info.has_expect).map(|info| info.name).collect();
-        if !args.quiet && !names.is_empty() {
+        let fits: Vec<String> = loaded.fits().into_iter().map(str::to_string).collect();
+        let fits: Vec<String> = fits.into_iter().filter(|name| super::fit::expects(&loaded, name)).collect();
+        let is_tested = !names.is_empty() || !fits.is_empty();
+        if !args.quiet && is_tested {
             terminal.line(&file.display().to_string());
         }
         for name in names {
             tally.add(experiment(args, &mut loaded, &name, timings, terminal));
         }
+        for name in fits {
+            tally.add(fit(args, &mut loaded, &name, timings, terminal));
+        }
     }
     if tally.passed + tally.failed == 0 {
-        terminal.error("nothing to test: no experiment has an `expect`");
+        terminal.error("nothing to test: no experiment and no fit has an `expect`");
     }
     terminal.line(&format!("{} passed, {} failed", tally.passed, tally.failed));
     if tally.failed == 0 && tally.passed > 0 { End::Fine } else { End::Failed }
@@ -102,6 +109,21 @@ fn experiment(args: &Test, loaded: &mut Loaded, name: &str, timings: &mut Timing
     for crossed in crossed.iter().flatten().filter(|crossed| !args.quiet || !crossed.passed()) {
         terminal.print(&crossed.words(terminal, "          "));
     }
+    passed
+}
+
+/// Fits; returns whether the expectations hold of the fitted run.
+fn fit(args: &Test, loaded: &mut Loaded, name: &str, timings: &mut Timings, terminal: &mut Terminal) -> bool {
+    let begin = Instant::now();
+    let verdicts = super::fit::verdicts(loaded, name, args.interpret, terminal);
+    let wall = begin.elapsed().as_secs_f64();
+    timings.add("run", wall);
+    let failed: Option<Vec<_>> = verdicts.map(|all| all.into_iter().filter(|verdict| !verdict.passed()).collect());
+    let passed = failed.as_ref().is_some_and(Vec::is_empty);
+    if !(passed && args.quiet) {
+        terminal.line(&line(terminal, passed, name, &duration(wall, 3)));
+    }
+    terminal.print(&results::verdicts(terminal, &failed.unwrap_or_default(), None, args.trust.digits, "          "));
     passed
 }
 

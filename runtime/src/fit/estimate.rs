@@ -1,6 +1,7 @@
 //! The procedure of a fit: from a start to values with intervals.
 //!
-//! In: a [`Question`]. Out: an [`Answer`], or a [`Trouble`]. Output error, weighted by a noise model: first white noise,
+//! In: a [`Question`]. Out: an [`Answer`], or a [`Trouble`]. Several starts are judged, and searches follow the best of
+//! them until two end alike. Output error, weighted by a noise model: first white noise,
 //! then twice an autoregressive model of the residuals, with which residuals and derivatives are whitened and the search
 //! continues. Derivatives are central differences, of a size that the noise determines.
 
@@ -9,6 +10,7 @@ use crate::fit::noise::Noise;
 use crate::fit::quantiles;
 use crate::fit::trust_region::{End, Ended, Limits, Objective, minimise};
 use crate::fit::unknowns::{Elementary, Unknown};
+use crate::rng::Chance;
 use std::collections::BTreeMap;
 
 /// Differences between model and measurement: for each item, a number for each row.
@@ -41,6 +43,10 @@ pub struct Question<'a> {
     pub level: f64,
     /// Most trial points of each stage.
     pub trials: u32,
+    /// Number of starts that are judged, the written one among them.
+    pub starts: usize,
+    /// Seed of the other starts.
+    pub seed: u64,
 }
 
 /// Why a fit gives no answer.
@@ -92,6 +98,12 @@ pub struct Answer {
     pub residuals: Residuals,
     /// How the search ended.
     pub why: Ended,
+    /// Starts that were judged.
+    pub starts: usize,
+    /// Searches that were followed to their ends.
+    pub followed: usize,
+    /// Searches that ended where the best did.
+    pub agreed: usize,
     /// Number of runs, and how many of them failed for each cause.
     pub runs: u64,
     /// Causes of failed runs, with their numbers.
@@ -109,14 +121,23 @@ const LEAST_SENSITIVITY: f64 = 4.0;
 const ROUGH: f64 = 0.05;
 /// Rounds of weights for several items of unknown noise.
 const MOST_ROUNDS: u32 = 6;
+/// Starts that are run at once: their residuals are in memory together.
+const JUDGED_AT_ONCE: usize = 16;
+/// Fewest and most searches that are followed to their ends, where there are as many starts.
+const LEAST_FOLLOWED: usize = 3;
+const MOST_FOLLOWED: usize = 6;
+/// Searches whose −2 log-likelihoods differ by less ended in the same minimum.
+const SAME_END: f64 = 0.5;
 /// A coordinate this near to a bound is at it, as a fraction of the range.
 const AT_BOUND: f64 = 1e-6;
+/// The part of the range in which a coordinate at a bound stays.
+const HELD_AT_BOUND: f64 = 1e-7;
 
 /// Finds the values that fit best, from the start.
 ///
 /// # Errors Why there is no answer.
 pub fn fit(question: Question) -> Result<Answer, Trouble> {
-    let Question { unknowns, items, independent, run, with, level, trials } = question;
+    let Question { unknowns, items, independent, run, with, level, trials, starts, seed } = question;
     let n = unknowns.len();
     assert!(n > 0 && !items.is_empty(), "{n} unknowns, {} items", items.len());
     let (low, high): (Vec<f64>, Vec<f64>) = unknowns.iter().map(|unknown| unknown.bounds(&with)).unzip();
@@ -134,38 +155,47 @@ pub fn fit(question: Question) -> Result<Answer, Trouble> {
         failures: BTreeMap::new(),
     };
     let limits = Limits { trials, tolerance: 1e-8 };
-    let mut x: Vec<f64> = unknowns.iter().map(|unknown| unknown.coordinate(unknown.start, &with)).collect();
-    let first = search.residuals(&x).map_err(Trouble::NoStart)?;
-    let rows: usize = first.iter().map(Vec::len).sum();
+    let written: Vec<f64> = unknowns.iter().map(|unknown| unknown.coordinate(unknown.start, &with)).collect();
+    let (judged, rows) = search.judge(items, &spread(&written, &low, &high, starts, seed)).map_err(Trouble::NoStart)?;
     if rows <= n {
         return Err(Trouble::TooFewRows(rows, n));
     }
-    search.weigh(items, &first, false);
-    let mut end: Option<End> = None;
-    // White noise, weighted by its size in each item, until the weights settle.
-    for _ in 0..MOST_ROUNDS {
-        let found = minimise(&x, &low, &high, &mut search, limits);
-        if found.why == Ended::NoStart {
-            return Err(Trouble::NoStart(search.commonest()));
+    let mut ends: Vec<Followed> = Vec::new();
+    for start in judged.into_iter().take(MOST_FOLLOWED) {
+        match search.follow(items, start, limits)? {
+            Some(followed) => ends.push(followed),
+            None => continue,
         }
-        if end.is_none() {
+        if ends.len() == 1 {
             let idle: Vec<usize> = (0..n).filter(|k| !search.influence[*k]).collect();
             if !idle.is_empty() {
                 return Err(Trouble::NoInfluence(idle));
             }
         }
-        x.clone_from(&found.x);
-        end = Some(found);
-        let residuals = search.residuals(&x).map_err(Trouble::NoStart)?;
-        if !search.weigh(items, &residuals, false) || items.len() == 1 {
+        if agreed(&ends) >= 2 && ends.len() >= LEAST_FOLLOWED {
             break;
+        }
+    }
+    let followed = (ends.len(), agreed(&ends));
+    let best = ends.into_iter().min_by(|a, b| a.misfit.total_cmp(&b.misfit));
+    let Some(Followed { end, noise, .. }) = best else { return Err(Trouble::NoStart(search.commonest())) };
+    let mut x = end.x.clone();
+    search.noise = noise;
+    let mut end = Some(end);
+    // A model error that a bound causes looks like correlated noise, in which the parameter would leave the bound.
+    let (mut from, mut to) = (low.clone(), high.clone());
+    for k in 0..n {
+        match search.at_bound(&x, k) {
+            Some(Edge::Low) => to[k] = low[k] + HELD_AT_BOUND * (high[k] - low[k]),
+            Some(Edge::High) => from[k] = high[k] - HELD_AT_BOUND * (high[k] - low[k]),
+            None => {}
         }
     }
     // Twice: a noise model of the residuals, and on from there.
     for _ in 0..if independent { 0 } else { 2 } {
         let residuals = search.residuals(&x).map_err(Trouble::NoStart)?;
         search.weigh(items, &residuals, true);
-        let found = minimise(&x, &low, &high, &mut search, limits);
+        let found = minimise(&x, &from, &to, &mut search, limits);
         if found.why == Ended::NoStart {
             break;
         }
@@ -173,7 +203,45 @@ pub fn fit(question: Question) -> Result<Answer, Trouble> {
         end = Some(found);
     }
     let why = end.expect("there is a first stage").why;
-    search.conclude(items, &x, level, why)
+    search.conclude(items, &x, level, (why, starts, followed))
+}
+
+/// Where a search from one start ended, with white noise.
+struct Followed {
+    end: End,
+    noise: Vec<Noise>,
+    /// −2 log-likelihood, but for a constant.
+    misfit: f64,
+}
+
+/// The number of searches that ended where the best did.
+fn agreed(ends: &[Followed]) -> usize {
+    let least = ends.iter().map(|end| end.misfit).fold(f64::INFINITY, f64::min);
+    ends.iter().filter(|end| end.misfit - least <= SAME_END).count()
+}
+
+/// The written start, then a Latin hypercube (McKay, Beckman, Conover 1979) between the bounds.
+fn spread(written: &[f64], low: &[f64], high: &[f64], starts: usize, seed: u64) -> Vec<Vec<f64>> {
+    let more = starts.saturating_sub(1);
+    let mut chance = Chance(seed);
+    let mut all = vec![written.to_vec(); more + 1];
+    for k in 0..written.len() {
+        let mut cells: Vec<usize> = (0..more).collect();
+        for last in (1..more).rev() {
+            cells.swap(last, chance.below(last as u64 + 1) as usize);
+        }
+        for (start, cell) in all[1..].iter_mut().zip(cells) {
+            start[k] = low[k] + (high[k] - low[k]) * (cell as f64 + chance.fraction()) / more as f64;
+        }
+    }
+    all
+}
+
+/// A bound of a coordinate.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Edge {
+    Low,
+    High,
 }
 
 /// The state of a search.
@@ -224,11 +292,85 @@ impl Search<'_> {
         most.map_or_else(|| "the run gives no finite numbers".into(), |(why, _)| why.clone())
     }
 
+    /// The bound at which a coordinate is.
+    fn at_bound(&self, x: &[f64], k: usize) -> Option<Edge> {
+        let margin = AT_BOUND * (self.high[k] - self.low[k]);
+        if x[k] - self.low[k] < margin {
+            Some(Edge::Low)
+        } else if self.high[k] - x[k] < margin {
+            Some(Edge::High)
+        } else {
+            None
+        }
+    }
+
+    /// The starts that can be run: the written one, then the others by their misfit; and the number of their residuals.
+    ///
+    /// # Errors The commonest cause, if none can be run.
+    fn judge(&mut self, items: &[Item], starts: &[Vec<f64>]) -> Result<(Vec<Vec<f64>>, usize), String> {
+        let (mut misfits, mut rows) = (Vec::new(), 0);
+        for first in (0..starts.len()).step_by(JUDGED_AT_ONCE) {
+            let some = &starts[first..starts.len().min(first + JUDGED_AT_ONCE)];
+            for (k, residuals) in self.run_all(some).into_iter().enumerate() {
+                let Ok(residuals) = residuals else { continue };
+                rows = residuals.iter().map(Vec::len).sum();
+                misfits.push((first + k, self.misfit(items, &residuals)));
+            }
+        }
+        if misfits.is_empty() {
+            return Err(self.commonest());
+        }
+        // Failures are those of the search.
+        self.failures.clear();
+        misfits.sort_by(|a, b| (a.0 != 0).cmp(&(b.0 != 0)).then(a.1.total_cmp(&b.1)));
+        Ok((misfits.into_iter().map(|(k, _)| starts[k].clone()).collect(), rows))
+    }
+
+    /// How badly a start fits. Large residuals count little, so that a run that goes astray is bad and not infinitely bad.
+    fn misfit(&self, items: &[Item], residuals: &Residuals) -> f64 {
+        let of = |(item, rows): (&Item, &Vec<f64>)| -> f64 {
+            let (floor, scale) = match item.sd {
+                Some(sd) => (1.0, 1.0 / (sd * sd)),
+                None => ((1e-6 * mean_square(rows)).max(f64::MIN_POSITIVE), 1.0),
+            };
+            rows.iter().map(|r| (self.with.log)(floor + scale * r * r)).sum()
+        };
+        items.iter().zip(residuals).map(of).sum()
+    }
+
+    /// Searches from a start with white noise, weighted by its size in each item, until the weights settle. None if the
+    /// model cannot be run around it.
+    fn follow(&mut self, items: &[Item], start: Vec<f64>, limits: Limits) -> Result<Option<Followed>, Trouble> {
+        let (low, high) = (self.low.clone(), self.high.clone());
+        self.sizes = vec![FIRST_DIFFERENCE; start.len()];
+        let residuals = self.residuals(&start).map_err(Trouble::NoStart)?;
+        self.weigh(items, &residuals, false);
+        let mut x = start;
+        for round in 1.. {
+            let end = minimise(&x, &low, &high, self, limits);
+            if end.why == Ended::NoStart {
+                return Ok(None);
+            }
+            x.clone_from(&end.x);
+            let residuals = self.residuals(&x).map_err(Trouble::NoStart)?;
+            let settled = !self.weigh(items, &residuals, false);
+            if settled || items.len() == 1 || round >= MOST_ROUNDS {
+                let of = |(item, rows): (&Item, &Vec<f64>)| match item.sd {
+                    Some(sd) => rows.len() as f64 * mean_square(rows) / (sd * sd),
+                    None => rows.len() as f64 * (self.with.log)(mean_square(rows).max(f64::MIN_POSITIVE)),
+                };
+                let misfit = items.iter().zip(&residuals).map(of).sum();
+                return Ok(Some(Followed { end, noise: self.noise.clone(), misfit }));
+            }
+        }
+        unreachable!("the rounds end")
+    }
+
     /// Models the noise of each item from its residuals. Returns whether a weight has changed by more than 1 %.
     fn weigh(&mut self, items: &[Item], residuals: &Residuals, correlated: bool) -> bool {
         let mut changed = false;
         for (k, (item, residuals)) in items.iter().zip(residuals).enumerate() {
-            let mean = residuals.iter().map(|r| r * r).sum::<f64>() / residuals.len().max(1) as f64;
+            let mean = mean_square(residuals);
             let mut noise = if correlated { Noise::of(residuals, &self.with) } else { Noise::white(mean) };
             // Data that a model fits exactly have no noise to weigh by.
             noise.variance = item.sd.map_or(mean.max(f64::MIN_POSITIVE), |sd| sd * sd);
@@ -294,7 +436,13 @@ impl Search<'_> {
         }
     }
 
-    fn conclude(mut self, items: &[Item], x: &[f64], level: f64, why: Ended) -> Result<Answer, Trouble> {
+    fn conclude(
+        mut self,
+        items: &[Item],
+        x: &[f64],
+        level: f64,
+        (why, starts, (followed, agreed)): (Ended, usize, (usize, usize)),
+    ) -> Result<Answer, Trouble> {
         let n = x.len();
         let residuals = self.residuals(x).map_err(Trouble::NoStart)?;
         let failed = |this: &Self| Trouble::NoStart(this.commonest());
@@ -332,22 +480,12 @@ impl Search<'_> {
         let correlation = |i: usize, j: usize| if i == j { 1.0 } else { covariance(i, j) / (sd_of[i] * sd_of[j]) };
         // In SI a scale by logarithms of negative values reverses signs; of values and coordinates alike here.
         let sign = |k: usize| f64::copysign(1.0, self.unknowns[k].slope(values[k]));
-        let at_bound = |k: usize| {
-            let margin = AT_BOUND * (self.high[k] - self.low[k]);
-            let negative = sign(k) < 0.0;
-            if x[k] - self.low[k] < margin {
-                Some(negative)
-            } else if self.high[k] - x[k] < margin {
-                Some(!negative)
-            } else {
-                None
-            }
-        };
+        // A scale by logarithms of negative values reverses their order.
+        let at_bound = |k: usize| self.at_bound(x, k).map(|edge| (edge == Edge::High) == (sign(k) > 0.0));
         let undetermined = parts.values.iter().zip(&parts.vectors).filter_map(|(s, v)| {
             let sensitivity = s / variance.sqrt();
             (sensitivity < LEAST_SENSITIVITY).then(|| Combination { sensitivity, direction: v.clone() })
         });
-        let rms = |r: &Vec<f64>| (r.iter().map(|r| r * r).sum::<f64>() / r.len().max(1) as f64).sqrt();
         Ok(Answer {
             sd: (0..n).map(|k| sd_of[k] * self.unknowns[k].slope(values[k]).abs()).collect(),
             intervals: (0..n).map(interval).collect(),
@@ -355,17 +493,24 @@ impl Search<'_> {
             at_bound: (0..n).map(at_bound).collect(),
             undetermined: undetermined.collect(),
             rough,
-            rms: residuals.iter().map(rms).collect(),
+            rms: residuals.iter().map(|rows| mean_square(rows).sqrt()).collect(),
             chi_square,
             degrees,
             values,
             residuals,
             why,
+            starts,
+            followed,
+            agreed,
             noise: self.noise,
             runs: self.runs,
             failures: self.failures,
         })
     }
+}
+
+fn mean_square(rows: &[f64]) -> f64 {
+    rows.iter().map(|r| r * r).sum::<f64>() / rows.len().max(1) as f64
 }
 
 /// The value of a coordinate that may lie outside of the range.
@@ -409,7 +554,6 @@ impl Objective for Search<'_> {
 mod tests {
     use super::*;
     use crate::fit::unknowns::tests::PLATFORM;
-    use crate::rng::Chance;
 
     fn normal(chance: &mut Chance) -> f64 {
         (0..12).map(|_| chance.fraction()).sum::<f64>() - 6.0
@@ -434,7 +578,17 @@ mod tests {
             let one = |p: &Vec<f64>| Ok(vec![(0..data.len()).map(|t| decay(p, t as f64) - data[t]).collect()]);
             points.iter().map(one).collect::<Vec<Result<Residuals, String>>>()
         };
-        fit(Question { unknowns, items, independent: false, run: &mut run, with: PLATFORM, level: 0.95, trials: 100 })
+        fit(Question {
+            unknowns,
+            items,
+            independent: false,
+            run: &mut run,
+            with: PLATFORM,
+            level: 0.95,
+            trials: 100,
+            starts: 1,
+            seed: 0,
+        })
     }
 
     /// With the whitening left out, the intervals of correlated noise hold in 33 to 55 of 100.
@@ -477,6 +631,79 @@ mod tests {
         assert!((narrowed.sd[1] - 1e-6).abs() < 1e-8 && narrowed.sd[0] < free.sd[0], "{narrowed:?} {free:?}");
     }
 
+    /// A phase has many minima: from one start the search ends in the next one, from many in the true one. With starts
+    /// that are judged but not followed, some seeds end elsewhere.
+    #[test]
+    fn of_many_starts_the_best_minimum_is_found() {
+        let mut alone = 0;
+        for seed in 0..20 {
+            let mut chance = Chance(seed);
+            let (omega, phase) = (chance.between(2.0, 9.0), chance.between(0.5, 2.5));
+            let wave = |omega: f64, phase: f64, t: u32| (omega * 0.05 * f64::from(t) + phase).sin();
+            let data: Vec<f64> = (0..200).map(|t| wave(omega, phase, t) + 0.05 * normal(&mut chance)).collect();
+            let unknowns = [
+                Unknown { low: 1.0, high: 10.0, start: chance.between(1.0, 10.0), known: None },
+                Unknown { low: 0.0, high: 3.0, start: chance.between(0.0, 3.0), known: None },
+            ];
+            for starts in [1, 64] {
+                let mut run = |points: &[Vec<f64>]| {
+                    let one =
+                        |p: &Vec<f64>| Ok(vec![(0..200).map(|t| wave(p[0], p[1], t) - data[t as usize]).collect()]);
+                    points.iter().map(one).collect::<Vec<Result<Residuals, String>>>()
+                };
+                let items = &[Item { sd: None }];
+                let (unknowns, run) = (&unknowns, &mut run);
+                let question = Question {
+                    unknowns,
+                    items,
+                    independent: false,
+                    run,
+                    with: PLATFORM,
+                    level: 0.95,
+                    trials: 100,
+                    starts,
+                    seed,
+                };
+                let answer = fit(question).unwrap();
+                let found = (answer.values[0] - omega).abs() < 0.02;
+                alone += usize::from(starts == 1 && found);
+                assert!(starts == 1 || found, "seed {seed}: {omega}, {answer:?}");
+                assert_eq!(answer.starts, starts);
+                assert!(answer.agreed <= answer.followed && answer.followed <= MOST_FOLLOWED);
+            }
+        }
+        assert!(alone <= 10, "{alone} of 20 need one start only");
+    }
+
+    /// Each cell of each coordinate holds one start, so that few starts reach every part of a range.
+    #[test]
+    fn starts_are_spread_over_each_range() {
+        for seed in 0..50 {
+            let (low, high) = ([0.0, -3.0], [1.0, 5.0]);
+            let all = spread(&[0.5, 0.5], &low, &high, 17, seed);
+            assert_eq!((all.len(), &all[0][..]), (17, &[0.5, 0.5][..]));
+            for k in 0..2 {
+                let cell = |start: &Vec<f64>| (16.0 * (start[k] - low[k]) / (high[k] - low[k])) as usize;
+                let mut cells: Vec<usize> = all[1..].iter().map(cell).collect();
+                cells.sort_unstable();
+                assert_eq!(cells, (0..16).collect::<Vec<_>>(), "seed {seed}");
+            }
+        }
+    }
+
+    /// A true value beyond the bound leaves a model error that looks like noise; the parameter stays at its bound.
+    #[test]
+    fn a_parameter_at_its_bound_stays_there() {
+        for seed in 0..20 {
+            let mut chance = Chance(seed);
+            let data: Vec<f64> = (0..100).map(|t| decay(&TRUE, f64::from(t)) + 0.01 * normal(&mut chance)).collect();
+            let mut bounded = unknowns();
+            bounded[2] = Unknown { low: -1.0, high: TRUE[2] - 0.1, start: -0.8, known: None };
+            let answer = fitted(&data, &bounded, &[Item { sd: None }]).unwrap();
+            assert_eq!(answer.at_bound[2], Some(true), "seed {seed}: {answer:?}");
+        }
+    }
+
     #[test]
     fn trouble_is_named() {
         let data = vec![1.0; 3];
@@ -496,6 +723,8 @@ mod tests {
             with,
             level: 0.95,
             trials: 100,
+            starts: 1,
+            seed: 0,
         };
         assert_eq!(fit(question), Err(Trouble::NoInfluence(vec![1])));
         let mut never = |points: &[Vec<f64>]| points.iter().map(|_| Err("too many steps".to_string())).collect();
@@ -507,6 +736,8 @@ mod tests {
             with,
             level: 0.95,
             trials: 100,
+            starts: 1,
+            seed: 0,
         };
         assert_eq!(fit(question), Err(Trouble::NoStart("too many steps".into())));
     }
@@ -529,6 +760,8 @@ mod tests {
             with: PLATFORM,
             level: 0.95,
             trials: 100,
+            starts: 1,
+            seed: 0,
         };
         let answer = fit(question).unwrap();
         assert!((answer.values[0] * answer.values[1] - 1.0).abs() < 0.01, "{answer:?}");

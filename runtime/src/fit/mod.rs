@@ -10,6 +10,7 @@ pub mod least_squares;
 pub mod trust_region;
 pub mod noise;
 pub mod estimate;
+pub mod ranking;
 
 pub use estimate::{Answer, Item, Question, Trouble, fit};
 pub use trust_region::Ended;

@@ -45,6 +45,8 @@ pub struct Fitted {
     pub measures: Vec<f64>,
     /// What the fitted run is expected to fulfil.
     pub verdicts: Vec<Verdict>,
+    /// Rank among several laws, and the rms of rows that the law has not seen, in SI.
+    pub rank: Option<(usize, f64)>,
     /// Notes for the user.
     pub notes: Vec<String>,
 }
@@ -75,6 +77,7 @@ impl Fitted {
             level,
             seconds,
             unsettled: 0,
+            rank: None,
             measures: Vec::new(),
             verdicts: Vec::new(),
             notes,
@@ -156,10 +159,15 @@ impl Fitted {
             asks.unknowns.len(),
             results::solver(&Solver { step: self.step, ..self.solver })
         );
-        out += &format!("  {} runs in {}\n", count(answer.runs), duration(self.seconds, 3));
+        let starts = match answer.starts {
+            1 => String::new(),
+            n => format!("{} starts, {} followed, {} ended here; ", count(n as u64), answer.followed, answer.agreed),
+        };
+        out += &format!("  {starts}{} runs in {}\n", count(answer.runs), duration(self.seconds, 3));
         if let Some((why, times)) = answer.failures.iter().max_by_key(|(_, times)| **times) {
             let failed: u64 = answer.failures.values().sum();
-            out += &format!("  {} runs failed, {} because {why}\n", count(failed), count(*times));
+            let runs = if failed == 1 { "run" } else { "runs" };
+            out += &format!("  {} {runs} failed, {} of them: {why}\n", count(failed), count(*times));
         }
         if !self.converged() {
             out += match answer.why {
@@ -302,6 +310,9 @@ impl Fitted {
             "steady": asks.steady,
             "begins": number(asks.begins),
             "solver": results::solver(&Solver { step: self.step, ..self.solver }),
+            "rank": self.rank.map(|(rank, _)| rank),
+            "held_out_rms": self.rank.map(|(_, rms)| width(&asks.items[0].unit, rms)),
+            "starts": { "judged": answer.starts, "followed": answer.followed, "ended_here": answer.agreed },
             "runs": answer.runs,
             "failures": answer.failures.iter().map(|(why, n)| (why.clone(), json!(n))).collect::<serde_json::Map<_, _>>(),
             "expects": self.verdicts.iter().map(results::verdict_json).collect::<Vec<_>>(),
