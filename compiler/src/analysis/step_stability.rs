@@ -14,6 +14,7 @@ use crate::analysis::memo::Memo;
 use crate::ir::Func;
 use crate::ir::build::{Build, Env};
 use crate::ir::expr::Shared;
+use crate::ir::hash::HashMap;
 use crate::ir::interpret::run_once;
 use crate::ir::program::Program;
 use crate::math::expand;
@@ -22,7 +23,9 @@ use crate::numerics::fixed_step;
 use abi::Slot;
 use abi::description::{Kind, Quantity};
 use abi::plan::Method;
-use std::cell::OnceCell;
+use std::cell::{OnceCell, RefCell};
+use std::ops::ControlFlow;
+use std::rc::Rc;
 
 /// Limit on the number of continuous states of an analysed program.
 pub const MOST_STATES: usize = 48;
@@ -118,6 +121,8 @@ pub struct Bench<'a> {
     base: Vec<f64>,
     /// The points of all scans, which depend on neither method nor step.
     scanned: OnceCell<Vec<Scanned>>,
+    /// Steps of a program without delays, by method.
+    steps: RefCell<HashMap<u8, Rc<Func>>>,
 }
 
 /// The derivative of a method's fixed step with respect to the states.
@@ -203,6 +208,7 @@ impl<'a> Bench<'a> {
             n,
             base,
             scanned: OnceCell::new(),
+            steps: RefCell::default(),
         })
     }
 
@@ -525,32 +531,58 @@ impl<'a> Bench<'a> {
             block[slot] += if block[slot] + off > high { -off } else { off };
             widths.push(width);
         }
-        let test = self.excursions(method, &block, h, RUN);
-        // The reference method, which is stable for stiff models.
+        let test = self.excursions(method, &block, h, RUN, |_| false);
+        let goes_farther = |reference: &[f64]| {
+            test.iter().zip(reference).zip(&widths).any(|((test, reference), width)| {
+                let beyond = if width.is_finite() { *width } else { 1e-6 };
+                reference.is_finite() && (!test.is_finite() || *test > FARTHER * (reference + beyond))
+            })
+        };
+        // The reference method, which is stable for stiff models. Excursions only grow, so once the reference has gone
+        // nearly as far, the answer is known.
         let other = Method::Implicit;
-        let reference = self.excursions(other, &block, h / FINER as f64, RUN * FINER);
-        test.iter().zip(&reference).zip(&widths).any(|((test, reference), width)| {
-            let beyond = if width.is_finite() { *width } else { 1e-6 };
-            reference.is_finite() && (!test.is_finite() || *test > FARTHER * (reference + beyond))
-        })
+        let is_near = |reference: &[f64]| !goes_farther(reference);
+        !is_near(&vec![0.0; self.n])
+            && goes_farther(&self.excursions(other, &block, h / FINER as f64, RUN * FINER, is_near))
     }
 
-    /// The greatest distance of each state from its initial value within `steps` steps; infinite if it ceases to be
-    /// finite.
-    fn excursions(&self, method: Method, block: &[f64], h: f64, steps: usize) -> Vec<f64> {
+    /// The greatest distance of each state from its initial value within `steps` steps, or up to the first step after
+    /// which `is_enough`; infinite if it ceases to be finite.
+    fn excursions(
+        &self,
+        method: Method,
+        block: &[f64],
+        h: f64,
+        steps: usize,
+        is_enough: impl Fn(&[f64]) -> bool,
+    ) -> Vec<f64> {
         let mut farthest = vec![0.0_f64; self.n];
         self.run(method, block, h, steps, |first, now| {
             for (farthest, (x, first)) in farthest.iter_mut().zip(now.iter().zip(first)) {
                 let far = (x - first).abs();
                 *farthest = if far.is_finite() { farthest.max(far) } else { f64::INFINITY };
             }
+            if is_enough(&farthest) { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
         });
         farthest
     }
 
+    /// The step of a method with all ticks and transitions, expanded, for a program without delays.
+    fn step(&self, method: Method) -> Rc<Func> {
+        let make = || Rc::new(expand(&fixed_step::step(self.program, method)));
+        self.steps.borrow_mut().entry(method as u8).or_insert_with(make).clone()
+    }
+
     /// Runs with all ticks and transitions. Calls `look` with the initial and the present states after each step, until
-    /// they cease to be finite.
-    fn run(&self, method: Method, block: &[f64], h: f64, steps: usize, mut look: impl FnMut(&[f64], &[f64])) {
+    /// it breaks or they cease to be finite.
+    fn run(
+        &self,
+        method: Method,
+        block: &[f64],
+        h: f64,
+        steps: usize,
+        mut look: impl FnMut(&[f64], &[f64]) -> ControlFlow<()>,
+    ) {
         let mut program = self.program.clone();
         program.size_rings(h);
         let layout = &program.description.layout;
@@ -567,14 +599,16 @@ impl<'a> Bench<'a> {
         run_once(&expand(&program.start), &mut at, &program.description.pool);
         at[layout.states.range()].copy_from_slice(&block[self.program.description.layout.states.range()]);
         let first = at[layout.states.range()].to_vec();
-        let step = expand(&fixed_step::step(&program, method));
+        let step = match program.description.delays.is_empty() {
+            true => self.step(method),
+            false => Rc::new(expand(&fixed_step::step(&program, method))),
+        };
         // Limit on the cost of a run.
         let most = WORK / (2 * step.ops.len());
         for _ in 0..steps.min(most.max(RUN)) {
             run_once(&step, &mut at, &program.description.pool);
             let now = &at[layout.states.range()];
-            look(&first, now);
-            if now.iter().any(|x| !x.is_finite()) {
+            if look(&first, now).is_break() || now.iter().any(|x| !x.is_finite()) {
                 break;
             }
         }
@@ -608,6 +642,7 @@ impl<'a> Bench<'a> {
                     farthest = farthest.max(by.abs());
                 }
                 (before, moved) = (now[k], by);
+                ControlFlow::Continue(())
             });
             (changes >= CHATTER.1 && farthest > 1e-2 * amplitude).then_some(Chatter { state: k, amplitude: farthest })
         })
