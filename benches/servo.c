@@ -50,6 +50,47 @@ void rk4(double *state, const Params *params, double h, uint64_t count) {
     for (int i = 0; i < 5; i++) state[i] = x[i];
 }
 
+/* The friction force of these states. */
+static inline double force(const Params *p, const double x[5]) {
+    double ratio = x[1] / p->vs;
+    double g = p->Fc + (p->Fs - p->Fc) * exp(-(ratio * ratio));
+    double dz = x[1] - p->sigma0 * fabs(x[1]) / g * x[2];
+    return p->sigma0 * x[2] + p->sigma1 * dz + p->sigma2 * x[1];
+}
+
+/* The same with the friction force after every step, as a sixth number: somebody reads it there. */
+void euler_force(double *state, const Params *params, double h, uint64_t count) {
+    Params p = *params;
+    double x[5], dx[5];
+    volatile double *F = state + 5;
+    for (int i = 0; i < 5; i++) x[i] = state[i];
+    for (uint64_t n = 0; n < count; n++) {
+        derivatives(&p, x, dx);
+        for (int i = 0; i < 5; i++) x[i] += h * dx[i];
+        *F = force(&p, x);
+    }
+    for (int i = 0; i < 5; i++) state[i] = x[i];
+}
+
+void rk4_force(double *state, const Params *params, double h, uint64_t count) {
+    volatile double *F = state + 5;
+    Params p = *params;
+    double x[5], y[5], k1[5], k2[5], k3[5], k4[5];
+    for (int i = 0; i < 5; i++) x[i] = state[i];
+    for (uint64_t n = 0; n < count; n++) {
+        derivatives(&p, x, k1);
+        for (int i = 0; i < 5; i++) y[i] = x[i] + h / 2 * k1[i];
+        derivatives(&p, y, k2);
+        for (int i = 0; i < 5; i++) y[i] = x[i] + h / 2 * k2[i];
+        derivatives(&p, y, k3);
+        for (int i = 0; i < 5; i++) y[i] = x[i] + h * k3[i];
+        derivatives(&p, y, k4);
+        for (int i = 0; i < 5; i++) x[i] += h / 6 * (k1[i] + 2 * (k2[i] + k3[i]) + k4[i]);
+        *F = force(&p, x);
+    }
+    for (int i = 0; i < 5; i++) state[i] = x[i];
+}
+
 /* The contact alone, its speed prescribed: a sine of 10 mm/s and 1 Hz. States: bristle deflection, number of steps. */
 void contact(double *state, const Params *params, double h, uint64_t count) {
     Params p = *params;

@@ -16,6 +16,21 @@ pub struct Instance {
     is_prepared: bool,
     /// The same program for adaptive runs, where this one has fixed steps and there is such.
     adaptive: Option<Arc<Instance>>,
+    /// The code of `Step`: `code`, or that of the slice.
+    step: Code,
+    /// A step that leaves outputs out, if there is one, and whether it is the one in use.
+    slice: Option<Slice>,
+    is_sliced: bool,
+}
+
+/// A fixed step without those outputs that a run does not read (program slicing: Weiser, ICSE 1981). It advances the
+/// model with the same bits and watches the same ranges, but does not store these outputs, nor test that they are finite.
+#[derive(Clone)]
+pub struct Slice {
+    /// The code; only its `Step` is used.
+    pub code: Code,
+    /// The outputs that it does not store.
+    pub left_out: Arc<[Slot]>,
 }
 
 impl Instance {
@@ -26,7 +41,52 @@ impl Instance {
         let size = description.layout.size();
         let mut numbers = vec![0.0; size + prepared];
         numbers[description.layout.params.range()].copy_from_slice(params);
-        Instance { description, code, numbers, size, is_prepared: false, adaptive: None }
+        let (step, slice) = (code.clone(), None);
+        Instance { description, code, numbers, size, is_prepared: false, adaptive: None, step, slice, is_sliced: false }
+    }
+
+    /// The same with a step that leaves outputs out, for [`Instance::read_only`].
+    pub fn with_slice(self, slice: Slice) -> Instance {
+        Instance { slice: Some(slice), ..self }
+    }
+
+    /// From now on, outputs other than these need not be stored after a step.
+    pub fn read_only(&mut self, slots: impl IntoIterator<Item = Slot>) {
+        let Some(slice) = &self.slice else { return };
+        if slots.into_iter().any(|slot| slice.left_out.contains(&slot)) {
+            self.read_all();
+        } else {
+            (self.step, self.is_sliced, self.is_prepared) = (slice.code.clone(), true, false);
+        }
+    }
+
+    /// From now on, each step stores all outputs again.
+    pub fn read_all(&mut self) {
+        if self.is_sliced {
+            (self.step, self.is_sliced, self.is_prepared) = (self.code.clone(), false, false);
+        }
+    }
+
+    /// One step that stores all outputs, and its status.
+    pub fn advance_in_full(&mut self) -> u64 {
+        let step = std::mem::replace(&mut self.step, self.code.clone());
+        self.is_prepared = false;
+        let status = self.advance(1);
+        (self.step, self.is_prepared) = (step, false);
+        status
+    }
+
+    /// Computes the outputs that the last step has left out, if it has. They may differ from those of a step by its
+    /// rounding.
+    pub fn complete(&mut self) {
+        if self.is_sliced {
+            self.call(Function::Outputs);
+        }
+    }
+
+    /// The outputs that a step does not store now.
+    pub fn left_out(&self) -> &[Slot] {
+        self.slice.as_ref().filter(|_| self.is_sliced).map_or(&[], |slice| &slice.left_out)
     }
 
     /// The same with its program as an adaptive run needs it: what fixed steps are judged by.
@@ -91,7 +151,8 @@ impl Instance {
     pub fn call_up_to(&mut self, function: Function, n: u64) -> u64 {
         let before = self.get(Slot::COUNT);
         let single = if (function, n) == (Function::Step, 1) { self.step_prepared() } else { None };
-        let call = || self.code.call(function, &mut self.numbers, &self.description.pool, n);
+        let code = if function == Function::Step { &self.step } else { &self.code };
+        let call = || code.call(function, &mut self.numbers, &self.description.pool, n);
         let status = single.unwrap_or_else(call);
         if function == Function::Step && n > 0 {
             keep_clock(&mut self.numbers, before, n);
@@ -101,7 +162,7 @@ impl Instance {
 
     /// One fixed step with hoisted values, if the code has such a step.
     fn step_prepared(&mut self) -> Option<u64> {
-        let machine = self.code.made(Function::Step)?;
+        let machine = self.step.made(Function::Step)?;
         let size = self.size + machine.prepared()?.len;
         if self.numbers.len() < size {
             // The code was compiled since this instance was created.

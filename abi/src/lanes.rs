@@ -23,6 +23,8 @@ pub struct Lanes {
     scratch: usize,
     pool_len: usize,
     name: String,
+    /// Outputs that the step does not store.
+    left_out: Arc<[Slot]>,
     _memory: Arc<dyn Any + Send + Sync>,
 }
 
@@ -42,7 +44,17 @@ impl Lanes {
         name: String,
         memory: Arc<dyn Any + Send + Sync>,
     ) -> Lanes {
-        Lanes { entry, width, size, scratch, pool_len, name, _memory: memory }
+        Lanes { entry, width, size, scratch, pool_len, name, left_out: Arc::default(), _memory: memory }
+    }
+
+    /// The same code, whose step does not store these outputs: see [`Slice`](crate::Slice).
+    pub fn leaving_out(self, left_out: Arc<[Slot]>) -> Lanes {
+        Lanes { left_out, ..self }
+    }
+
+    /// The outputs that its step does not store.
+    pub fn left_out(&self) -> &[Slot] {
+        &self.left_out
     }
 
     /// Number of instances.
@@ -101,6 +113,11 @@ impl Batch {
     /// Number of instances.
     pub fn width(&self) -> usize {
         self.lanes.width
+    }
+
+    /// The outputs that a step does not store.
+    pub fn left_out(&self) -> &[Slot] {
+        &self.lanes.left_out
     }
 
     fn at(&self, slot: Slot, lane: usize) -> (usize, usize) {

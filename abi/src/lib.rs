@@ -24,5 +24,5 @@ pub mod image;
 pub mod fits;
 
 pub use description::{Description, Layout, Slot};
-pub use instance::Instance;
+pub use instance::{Instance, Slice};
 pub use table::{Code, Function};

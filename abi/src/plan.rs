@@ -5,6 +5,7 @@ use crate::description::Slot;
 use crate::rig::Bench;
 pub use crate::series::{Method, PARTS, Series, Solver, Steps};
 use crate::unit::Unit;
+use std::collections::BTreeSet;
 use std::fmt;
 use std::sync::Arc;
 
@@ -27,6 +28,16 @@ pub struct Experiment {
     pub corners: Vec<f64>,
     /// The system is judged as it is stepped: the discretisation error leaves no verdict undecided.
     pub stepped: bool,
+}
+
+impl Experiment {
+    /// The slots that its measures and plots read during a run.
+    pub fn reads(&self) -> BTreeSet<Slot> {
+        let series =
+            self.plots.iter().flat_map(|plot| plot.series.iter().chain(&plot.against)).map(|series| series.slot);
+        let measures = self.expects.iter().flat_map(|expect| &expect.measures);
+        series.chain(measures.flat_map(Measure::reads)).collect()
+    }
 }
 
 /// One plot.
@@ -111,6 +122,24 @@ pub struct Measure {
     pub unit: Unit,
     /// The part of the expectation's window that it covers.
     pub window: Window,
+}
+
+impl Measure {
+    /// The slots that it reads: of the quantity, of the edges of its window, and of an instant of the run.
+    fn reads(&self) -> impl Iterator<Item = Slot> {
+        let edge = |edge: Edge| match edge {
+            Edge::First(slot) => Some(slot),
+            Edge::Open | Edge::At(_) => None,
+        };
+        let moment = if let MeasureKind::AtMoment(moment) = self.kind {
+            let (Moment::First(slot) | Moment::Rises(slot) | Moment::Least(slot) | Moment::Greatest(slot)) = moment;
+            Some(slot)
+        } else {
+            None
+        };
+        let edges = [edge(self.window.after), edge(self.window.before)];
+        [Some(self.slot), moment].into_iter().chain(edges).flatten()
+    }
 }
 
 /// The part of a run that a measure covers.

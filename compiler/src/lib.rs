@@ -35,7 +35,7 @@ pub use experiment::Changes;
 
 use abi::plan::Method;
 use abi::table::Code;
-use abi::{Function, Instance, Slot};
+use abi::{Description, Function, Instance, Slice, Slot};
 use grammar::ast::Item;
 use grammar::diagnostic::{Diagnostic, Recurring};
 use grammar::span::FileId;
@@ -101,7 +101,8 @@ pub fn varying(
     }
     let one = |variant: experiment::Variant| {
         let paths = varied(&variant);
-        runs(variant, &paths, &loaded.files, options.interpret)
+        let slice = sliced(&variant.program, &variant.experiment);
+        runs(variant, slice, &paths, &loaded.files, options.interpret)
     };
     Ok(variants.into_iter().map(one).collect())
 }
@@ -121,7 +122,8 @@ pub fn fit(
         return Err(vec![error]);
     }
     let paths = experiment::start_values::params(&variant.system, &paths);
-    Ok(fit::Fit { varying: runs(variant, &paths, &loaded.files, options.interpret), asks })
+    // It reads other quantities than measures and plots.
+    Ok(fit::Fit { varying: runs(variant, None, &paths, &loaded.files, options.interpret), asks })
 }
 
 /// Compiles an experiment once for runs that differ in any of its parameters, as [`varying`] does for those that are
@@ -150,14 +152,16 @@ pub fn adjustable(
         let params = description.quantities.iter().filter(|q| description.layout.params.contains(q.slot));
         let mut paths: Vec<String> = params.map(|quantity| quantity.path.clone()).collect();
         paths.retain(|path| experiment::vary::built_in(&variant, std::slice::from_ref(path)).is_none());
-        runs(variant, &paths, &loaded.files, options.interpret)
+        runs(variant, None, &paths, &loaded.files, options.interpret)
     };
     Ok(variants.into_iter().map(one).collect())
 }
 
-/// An experiment with its code, for runs that differ in the parameters `paths`.
+/// An experiment with its code, for runs that differ in the parameters `paths`. `slice`: the program whose step leaves
+/// out what nothing in these runs reads, if there is such.
 fn runs(
     variant: experiment::Variant,
+    slice: Option<ir::program::Program>,
     paths: &[String],
     files: &frontend::source::Files,
     interpret: bool,
@@ -168,12 +172,19 @@ fn runs(
     let functions = functions(&coded, variant.experiment.solver.method);
     let (code, notes) = code(&functions, &coded.description, interpret);
     let alone = interpret || variant.experiment.bench.is_some();
-    let lanes = if alone { None } else { codegen::tiering::lanes(&coded, variant.experiment.solver.method) };
+    let slice = slice.map(|sliced| {
+        let guards = coded.description.guards.clone();
+        ir::program::Program { description: Description { guards, ..sliced.description }, ..sliced }
+    });
+    let many = slice.as_ref().unwrap_or(&coded);
+    let lanes = if alone { None } else { codegen::tiering::lanes(many, variant.experiment.solver.method) };
+    let slice = slice.map(|sliced| step_of(&sliced, variant.experiment.solver.method, interpret));
     let adaptive = variant.adaptive.as_ref().map(|program| {
         let code = codegen::tiering::on_demand(program, Method::Adaptive, interpret);
         Arc::new(Instance::new(Arc::new(program.description.clone()), code, &program.params))
     });
-    experiment::vary::Varying::new(variant, paths, files, experiment::vary::Runnable { code, lanes, adaptive, notes })
+    let runnable = experiment::vary::Runnable { code, slice, lanes, adaptive, notes };
+    experiment::vary::Varying::new(variant, paths, files, runnable)
 }
 
 /// A model or an experiment as one program, for uses other than a run (C, images, listings).
@@ -385,6 +396,8 @@ struct CachedCode {
     program: ir::program::Program,
     method: Method,
     code: Code,
+    /// The step without the outputs that the experiment does not read, if it has such.
+    slice: Option<Slice>,
     /// Code for adaptive runs, if it differs from `code`.
     adaptive: Option<Code>,
     notes: Vec<String>,
@@ -403,6 +416,7 @@ impl CachedCode {
             transitions,
             roots,
             balanced: _,
+            left_out: _,
         } = program;
         let made = &self.program;
         self.method == method
@@ -410,6 +424,26 @@ impl CachedCode {
             && (&made.derivatives, &made.tick) == (derivatives, tick)
             && (&made.transitions, &made.roots) == (transitions, roots)
     }
+
+    /// The outputs that its slice leaves out.
+    fn left_out(&self) -> &[Slot] {
+        self.slice.as_ref().map_or(&[], |slice| &slice.left_out)
+    }
+}
+
+/// The program whose fixed step leaves out the outputs that nothing in an experiment reads; none if there are no such.
+fn sliced(program: &ir::program::Program, experiment: &abi::plan::Experiment) -> Option<ir::program::Program> {
+    if experiment.solver.method == Method::Adaptive || experiment.bench.is_some() {
+        return None;
+    }
+    let read = experiment.reads();
+    let left_out: Vec<Slot> = program.outputs_for_readers().filter(|slot| !read.contains(slot)).collect();
+    (!left_out.is_empty()).then(|| ir::program::Program { left_out, ..program.clone() })
+}
+
+/// The step of such a program.
+fn step_of(sliced: &ir::program::Program, method: Method, interpret: bool) -> Slice {
+    Slice { code: codegen::tiering::on_demand(sliced, method, interpret), left_out: sliced.left_out.as_slice().into() }
 }
 
 /// Makes a case runnable. Cases of a sweep over parameters differ only in numbers of the block, so each reuses the code
@@ -422,14 +456,20 @@ fn case(variant: experiment::Variant, interpret: bool, made: &mut Option<CachedC
     }
     let method = rig.as_ref().map_or(experiment.solver.method, |simulated| simulated.rig.method);
     let (description, params) = (Arc::new(program.description.clone()), program.params.clone());
-    if !made.as_ref().is_some_and(|made| made.fits(&program, method)) {
+    let slice = if rig.is_none() { sliced(&program, &experiment) } else { None };
+    let left_out = slice.as_ref().map_or(&[][..], |sliced| &sliced.left_out);
+    if !made.as_ref().is_some_and(|made| made.fits(&program, method) && made.left_out() == left_out) {
         let (code, notes) = codegen::tiering::late(&program, method, interpret);
+        let slice = slice.map(|sliced| step_of(&sliced, method, interpret));
         let adaptive =
             adaptive.as_ref().map(|program| codegen::tiering::on_demand(program, Method::Adaptive, interpret));
-        *made = Some(CachedCode { program, method, code, adaptive, notes });
+        *made = Some(CachedCode { program, method, code, slice, adaptive, notes });
     }
-    let CachedCode { code, adaptive: adaptive_code, notes, .. } = made.as_ref().expect("it was just made");
+    let CachedCode { code, slice, adaptive: adaptive_code, notes, .. } = made.as_ref().expect("it was just made");
     let mut instance = Instance::new(description, code.clone(), &params);
+    if let Some(slice) = slice {
+        instance = instance.with_slice(slice.clone());
+    }
     if let Some((program, code)) = adaptive.zip(adaptive_code.clone()) {
         instance = instance.with_adaptive(Arc::new(Instance::new(Arc::new(program.description), code, &params)));
     }

@@ -13,6 +13,7 @@ use crate::ir::interpret::Interpreter;
 use crate::ir::program::Program;
 use crate::math;
 use crate::numerics::{autodiff, fixed_step, rosenbrock};
+use crate::opt::guard_reduction::reduce_guards;
 use crate::opt::{self, Context};
 use abi::lanes::Lanes;
 use abi::plan::Method;
@@ -52,7 +53,13 @@ fn function(program: &Program, method: Method, which: Function) -> Option<Func> 
 /// # Panics
 /// For the adaptive method, which has no fixed step.
 pub fn step(program: &Program, method: Method) -> Func {
-    opt::optimise(fixed_step::step(program, method), Context::of(program))
+    let (step, context) = (fixed_step::step(program, method), Context::of(program));
+    if program.left_out.is_empty() {
+        return opt::optimise(step, context);
+    }
+    // Guard reduction is the last pass, and the only one that depends on what is guarded.
+    let step = opt::optimise_without(step, context, Some("guard_reduction"));
+    reduce_guards(&fixed_step::slice(&step, &program.description.guards, &program.left_out))
 }
 
 /// Compiles the steps of a method for many instances, in the widest vectors of this processor. None if there are no
@@ -78,7 +85,9 @@ pub fn of_lanes(program: &Program, method: Method) -> Option<(Function, Func)> {
 /// As [`lanes`](lanes()), with a given width and number of interleaved vectors.
 pub fn lanes_of(program: &Program, method: Method, width: Width, vectors: usize) -> Option<Lanes> {
     let (_, func) = of_lanes(program, method)?;
-    lanes::compile(&func, &program.description.layout, program.description.pool.len(), width, vectors).ok()
+    let lanes =
+        lanes::compile(&func, &program.description.layout, program.description.pool.len(), width, vectors).ok()?;
+    Some(lanes.leaving_out(program.left_out.as_slice().into()))
 }
 
 /// Whether a method needs a function and the program can have it.

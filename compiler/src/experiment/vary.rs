@@ -18,7 +18,7 @@ use abi::live::is_multiple;
 use abi::plan::{Edge, Expect, Experiment, Formula, Measure, MeasureKind, Method, Plot, Window};
 use abi::table::Code;
 use abi::unit::Unit;
-use abi::{Description, Instance, Slot};
+use abi::{Description, Instance, Slice, Slot};
 use grammar::diagnostic::Diagnostic;
 use std::sync::Arc;
 
@@ -35,6 +35,7 @@ pub struct Varying {
     description: Arc<Description>,
     params: Vec<f64>,
     code: Code,
+    slice: Option<Slice>,
     lanes: Option<Lanes>,
     adaptive: Option<Arc<Instance>>,
     varied: Vec<String>,
@@ -71,6 +72,9 @@ enum Use {
 pub struct Runnable {
     /// Code for single runs.
     pub code: Code,
+    /// The step for single runs without the outputs that the experiment does not read, if it has such. The lanes leave out
+    /// the same.
+    pub slice: Option<Slice>,
     /// Code for many runs at once in lanes, if available.
     pub lanes: Option<Lanes>,
     /// The program for adaptive runs of an experiment with fixed steps, if available.
@@ -90,7 +94,7 @@ pub struct PreparedRun {
 impl Varying {
     /// From an experiment as read, and its code.
     pub fn new(variant: Variant, vary: &[String], files: &Files, runnable: Runnable) -> Varying {
-        let Runnable { code, lanes, adaptive, notes } = runnable;
+        let Runnable { code, slice, lanes, adaptive, notes } = runnable;
         let Variant { label, system, types, program, mut experiment, places, .. } = variant;
         let varies = |expr: ExprId| depends(&system, expr, &|var| vary.contains(&var.path));
         let (mut exprs, mut uses) = (Vec::new(), Vec::new());
@@ -166,6 +170,7 @@ impl Varying {
             description: Arc::new(program.description),
             params: program.params,
             code,
+            slice,
             lanes,
             adaptive,
             varied: vary.to_vec(),
@@ -219,6 +224,9 @@ impl Varying {
         let mut instance = Instance::new(self.description.clone(), self.code.clone(), &self.params);
         if let Some(adaptive) = &self.adaptive {
             instance = instance.with_adaptive(adaptive.clone());
+        }
+        if let Some(slice) = &self.slice {
+            instance = instance.with_slice(slice.clone());
         }
         for (slot, value) in values {
             instance.set(*slot, *value);
@@ -304,6 +312,9 @@ impl Varying {
             let block = instance.block()[self.description.layout.params.range()].to_vec();
             // The adaptive program would check other ranges, so it is dropped.
             instance = Instance::new(Arc::new(description), self.code.clone(), &block);
+            if let Some(slice) = &self.slice {
+                instance = instance.with_slice(slice.clone());
+            }
         }
         Ok(PreparedRun { instance, experiment })
     }

@@ -108,7 +108,18 @@ pub fn lower(system: &System, types: &Types, wanted: &[Observed]) -> Lowered {
     description.roots = surfaces;
     let roots = (description.layout.roots.len > 0).then_some(roots);
     let observed = plan.observed.clone();
-    let program = Program { description, params, start, outputs, derivatives, tick, transitions, roots, balanced };
+    let program = Program {
+        description,
+        params,
+        start,
+        outputs,
+        derivatives,
+        tick,
+        transitions,
+        roots,
+        balanced,
+        left_out: Vec::new(),
+    };
     Lowered { program, observed }
 }
 

@@ -167,6 +167,8 @@ fn begin<T>(
             return None;
         }
     };
+    let left_out = course.instance().left_out().len();
+    assert_eq!(left_out, batch.left_out().len(), "lanes and run leave out the same outputs");
     match course.next(watch) {
         Ok(Some(left)) => {
             batch.load(number, course.instance().block());

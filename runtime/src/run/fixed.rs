@@ -27,6 +27,8 @@ pub(crate) struct Fixed {
     done: u64,
     /// Slots that the observer reads.
     seen: Vec<Range<usize>>,
+    /// Steps at the end of a batch that store all outputs: one if the others leave some out, else none.
+    full: u64,
 }
 
 impl Fixed {
@@ -46,6 +48,8 @@ impl Fixed {
         }
         let one = |slot: &Slot| slot.index()..slot.index() + 1;
         let slots = rest.observer.slots().iter().chain(rest.observer.probe.slots());
+        rest.instance.read_only(slots.clone().copied());
+        let full = u64::from(!rest.instance.left_out().is_empty());
         let mut run = Fixed {
             step,
             total,
@@ -54,6 +58,7 @@ impl Fixed {
             batch: 0,
             done: 0,
             seen: [Slot::COUNT].iter().chain(slots).map(one).collect(),
+            full,
             rest,
         };
         match run.begin(begin) {
@@ -89,45 +94,8 @@ impl Fixed {
         }
     }
 
-    /// Repeats the batch step by step up to the first state or output that is not finite.
-    fn first_not_finite(&mut self) -> Stop {
-        let instance = &mut self.rest.instance;
-        instance.block_mut().copy_from_slice(&self.saved);
-        for _ in 0..self.batch {
-            instance.advance(1);
-            if let Err(stop) = check_finite(instance) {
-                return stop;
-            }
-        }
-        unreachable!("the same {} steps gave a value that is not finite before", self.batch)
-    }
-}
-
-impl Stepper for Fixed {
-    fn function(&self) -> Function {
-        Function::Step
-    }
-
-    fn next(&mut self, watch: &mut dyn FnMut(f64) -> Continue) -> Result<Option<u64>, Stop> {
-        let Rest { instance, observer, work, .. } = &mut self.rest;
-        if self.done < self.batch {
-            return Ok(Some(if self.each { 1 } else { self.batch - self.done }));
-        }
-        work.steps += self.done;
-        if work.steps > 0 && watch(work.steps as f64 / self.total as f64).is_break() {
-            return Err(Stop { cause: Cause::Stopped, time: instance.get(Slot::TIME) });
-        }
-        if work.steps < self.total {
-            self.open();
-            return self.next(watch);
-        }
-        if !self.each {
-            observer.see(instance)?;
-        }
-        Ok(None)
-    }
-
-    fn take(&mut self, done: u64, status: u64) -> Result<(), Stop> {
+    /// Accepts the block after `done` steps, the last of which returned `status`.
+    fn accept(&mut self, done: u64, status: u64) -> Result<(), Stop> {
         if self.each {
             self.rest.observer.see(&self.rest.instance)?;
             self.probe();
@@ -147,13 +115,62 @@ impl Stepper for Fixed {
         check_status(&self.rest.instance, status)
     }
 
+    /// Repeats the batch step by step up to the first state or output that is not finite.
+    fn first_not_finite(&mut self) -> Stop {
+        let instance = &mut self.rest.instance;
+        instance.block_mut().copy_from_slice(&self.saved);
+        for _ in 0..self.batch {
+            instance.advance_in_full();
+            if let Err(stop) = check_finite(instance) {
+                return stop;
+            }
+        }
+        unreachable!("the same {} steps gave a value that is not finite before", self.batch)
+    }
+}
+
+impl Stepper for Fixed {
+    fn function(&self) -> Function {
+        Function::Step
+    }
+
+    fn next(&mut self, watch: &mut dyn FnMut(f64) -> Continue) -> Result<Option<u64>, Stop> {
+        if self.done + self.full < self.batch {
+            return Ok(Some(if self.each { 1 } else { self.batch - self.full - self.done }));
+        }
+        if self.done < self.batch {
+            let status = self.rest.instance.advance_in_full();
+            self.accept(1, status)?;
+        }
+        let Rest { instance, observer, work, .. } = &mut self.rest;
+        work.steps += self.done;
+        if work.steps > 0 && watch(work.steps as f64 / self.total as f64).is_break() {
+            return Err(Stop { cause: Cause::Stopped, time: instance.get(Slot::TIME) });
+        }
+        if work.steps < self.total {
+            self.open();
+            return self.next(watch);
+        }
+        if !self.each {
+            observer.see(instance)?;
+        }
+        Ok(None)
+    }
+
+    fn take(&mut self, done: u64, status: u64) -> Result<(), Stop> {
+        if status != 0 {
+            self.rest.instance.complete();
+        }
+        self.accept(done, status)
+    }
+
     fn instance(&mut self) -> &mut Instance {
         &mut self.rest.instance
     }
 
     fn fetch(&mut self, done: u64, status: u64, from: &dyn Fn(Range<usize>, &mut [f64])) {
         let block = self.rest.instance.block_mut();
-        let mut whole = status != 0 || self.done + done == self.batch;
+        let mut whole = status != 0 || self.done + done + self.full == self.batch;
         if !whole {
             for range in &self.seen {
                 from(range.clone(), block);
@@ -167,9 +184,20 @@ impl Stepper for Fixed {
         keep_time(block);
     }
 
-    fn bring(&self, _: &mut dyn FnMut(Range<usize>, &[f64])) {}
+    fn bring(&self, to: &mut dyn FnMut(Range<usize>, &[f64])) {
+        // After the last step of a batch, which was made here.
+        if self.full > 0 && self.done == 0 {
+            let block = self.rest.instance.block();
+            to(0..block.len(), block);
+        }
+    }
 
     fn rest(self: Box<Self>) -> Rest {
-        self.rest
+        let Fixed { mut rest, done, batch, .. } = *self;
+        if done < batch {
+            rest.instance.complete();
+        }
+        rest.instance.read_all();
+        rest
     }
 }

@@ -57,7 +57,7 @@ pub fn step(program: &Program, method: Method) -> Func {
         build.borrow_mut().inline(transitions, &mut env);
     }
     build.borrow_mut().inline(&program.outputs, &mut env);
-    let status = watch(&build, &program.description.guards, &env);
+    let status = watch(&build, &program.description.guards, &env, &[]);
 
     for delay in &program.description.delays {
         let index = ring_index(delay.ring, count).value;
@@ -94,6 +94,23 @@ pub fn advance(program: &Program, method: Method) -> Func {
     build.finish()
 }
 
+/// The step without these outputs (program slicing: Weiser, *Program Slicing*, ICSE 1981): it neither stores them nor
+/// tests that they are finite. All other results keep their bits, so it is made of a step that has been reassociated and
+/// contracted, in which operations no longer depend on the number of their uses. `step`: before guard reduction, since an
+/// output that is left out may be the addend that implies others.
+pub fn slice(step: &Func, guards: &[Guard], left_out: &[Slot]) -> Func {
+    let build = Shared::new(Build::of(step));
+    let env: Env = step.stores.iter().copied().collect();
+    let status = watch(&build, guards, &env, left_out);
+    let mut build = build.into_inner();
+    build.store_env(&env, |slot| !left_out.contains(&slot));
+    step.writes.iter().for_each(|write| build.write(*write));
+    if let Some(status) = status {
+        build.status(status);
+    }
+    build.finish()
+}
+
 /// The index of a sample in a ring whose length is a power of two. `number`: the sample's number, an integer from 0 to
 /// 2⁵².
 fn ring_index<'a>(ring: Segment, number: Real<'a>) -> Int<'a> {
@@ -110,7 +127,8 @@ pub const GAMMA: f64 = 1.0 - std::f64::consts::FRAC_1_SQRT_2;
 
 /// The status: 0, or the number of the first guard that fails. A guard fails if its quantity is not finite, or leaves
 /// its range by more than a tolerance: 1e-6 of the range's width, or of the bound if the range is open on one side.
-fn watch(build: &Shared, guards: &[Guard], env: &Env) -> Option<Value> {
+/// Guards of the quantities in `left_out` are not tested.
+fn watch(build: &Shared, guards: &[Guard], env: &Env, left_out: &[Slot]) -> Option<Value> {
     let mut total: Option<Real> = None;
     let mut outside: Option<Truth> = None;
     // A state that is also an output has two guards, but enters the sum once.
@@ -119,7 +137,7 @@ fn watch(build: &Shared, guards: &[Guard], env: &Env) -> Option<Value> {
     let mut first = number(0);
     for (group, guards) in guards.chunks(TOGETHER).enumerate().rev() {
         let (mut sum, mut beyond): (Option<Real>, Option<Truth>) = (None, None);
-        for (k, guard) in guards.iter().enumerate().rev() {
+        for (k, guard) in guards.iter().enumerate().rev().filter(|(_, guard)| !left_out.contains(&guard.slot)) {
             let x = Real::new(build, build.borrow_mut().read(guard.slot, env));
             let (low, high) = widened(guard.range);
             // A value between two finite bounds is finite.
