@@ -194,6 +194,24 @@ impl Batch {
         self.statuses[lane / 8].0[lane % 8]
     }
 
+    /// As [`advance`](Batch::advance), and appends to `rows` the values of these slots after each step: slot by slot, all
+    /// lanes of one after the other.
+    pub fn advance_and_read(&mut self, pool: &[f64], n: u64, slots: &[Slot], rows: &mut Vec<f64>) -> u64 {
+        for done in 0..n {
+            self.advance(pool, 1);
+            for slot in slots {
+                let (line, at) = self.at(*slot, 0);
+                let numbers = self.numbers[line..].iter().flat_map(|line| line.0).skip(at).take(self.lanes.width);
+                rows.extend(numbers.map(f64::from_bits));
+            }
+            let statuses = self.statuses.iter().flat_map(|line| line.0).take(self.lanes.width);
+            if statuses.fold(0, |all, status| all | status) != 0 {
+                return done + 1;
+            }
+        }
+        n
+    }
+
     /// Advances all lanes by up to `n` fixed steps and returns the number of steps done. Stops after a step at which
     /// the status of a lane is not 0. Time is only stored as far as the code does so: see
     /// [`keep_time`](crate::table::keep_time).

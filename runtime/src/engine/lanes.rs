@@ -26,6 +26,28 @@ pub enum Next<T> {
 const MOST: u64 = 4096;
 const PART: u64 = 16;
 
+/// The values of some slots after each of a few steps: step by step, slot by slot, lane by lane.
+struct Series<'r> {
+    slots: &'r [Slot],
+    rows: &'r [f64],
+    width: usize,
+}
+
+impl Series<'_> {
+    /// Writes the values of one lane after a step to a block.
+    fn read(&self, step: u64, lane: usize, block: &mut [f64]) {
+        let first = step as usize * self.slots.len();
+        for (k, slot) in self.slots.iter().enumerate() {
+            block[slot.index()] = self.rows[(first + k) * self.width + lane];
+        }
+    }
+}
+
+/// The number of calls until a run needs attention, if it would be `left` without a series.
+fn calls(course: &dyn Stepper, left: u64) -> u64 {
+    course.series().map_or(left, |(_, most)| most)
+}
+
 /// Runs everything that `next` delivers, in lanes; the solver of all runs must call the function of these lanes. Passes
 /// each outcome to `give`. `next` receives whether runs are in progress; if none is, it must not answer
 /// [`Next::Later`].
@@ -92,6 +114,7 @@ fn observed<T>(
     let mut astray = vec![true; batch.width()];
     let mut pool = None;
     let (mut calm, mut total, mut more) = (0, 0, true);
+    let mut rows: Vec<f64> = Vec::new();
     loop {
         let stride = (calm / PART).clamp(1, MOST);
         for lane in 0..all.len() {
@@ -117,7 +140,15 @@ fn observed<T>(
         let next = all.iter().flatten().map(|lane| lane.until).min().expect("there is one");
         let course = &mut all[model].as_mut().expect("there is one").course;
         let pool = pool.get_or_insert_with(|| course.instance().description().pool.clone());
-        let done = batch.advance(pool, (next - total).min(stride));
+        // Runs that read every step read the same slots, because they have the same plan.
+        rows.clear();
+        let seen = all.iter().flatten().find_map(|lane| Some(lane.course.series()?.0.to_vec()));
+        let count = (next - total).min(stride);
+        let done = match &seen {
+            Some(slots) => batch.advance_and_read(pool, count, slots, &mut rows),
+            None => batch.advance(pool, count),
+        };
+        let series = Series { slots: seen.as_deref().unwrap_or_default(), rows: &rows, width: batch.width() };
         total += done;
         let mut looked = false;
         for (number, place) in all.iter_mut().enumerate() {
@@ -126,11 +157,11 @@ fn observed<T>(
                 astray[number] |= status != 0;
                 continue;
             };
-            if status == 0 && lane.until > total {
+            if status == 0 && lane.until > total && lane.course.series().is_none() {
                 continue;
             }
             looked |= status != 0;
-            if let Some(result) = lane.look(&mut batch, (number, total), status, watch) {
+            if let Some(result) = lane.look(&mut batch, (number, total), status, &series, watch) {
                 let lane = place.take().expect("it was there");
                 astray[number] = true;
                 give(lane.tag, lane.course.rest(), result);
@@ -172,7 +203,8 @@ fn begin<T>(
     match course.next(watch) {
         Ok(Some(left)) => {
             batch.load(number, course.instance().block());
-            Some(Lane { tag, course, since: total, until: total.saturating_add(left) })
+            let until = total.saturating_add(calls(&*course, left));
+            Some(Lane { tag, course, since: total, until })
         }
         result => {
             give(tag, course.rest(), result.map(|_| ()));
@@ -189,16 +221,24 @@ impl<T> Lane<T> {
         batch: &mut Batch,
         (number, total): (usize, u64),
         status: u64,
+        series: &Series,
         watch: &mut dyn FnMut(f64) -> Continue,
     ) -> Option<Result<(), Stop>> {
         let done = total - std::mem::replace(&mut self.since, total);
+        // The last step is seen with all else in its block.
+        if let Some((slots, _)) = self.course.series() {
+            assert_eq!(slots, series.slots, "all runs in lanes read the same slots");
+            if let Err(stop) = self.course.show(done - 1, &|step, block| series.read(step, number, block)) {
+                return Some(Err(stop));
+            }
+        }
         self.course.fetch(done, status, &|slots, block| batch.save_part(number, slots, block));
         if let Err(stop) = self.course.take(done, status) {
             return Some(Err(stop));
         }
         match self.course.next(watch) {
             Ok(Some(left)) => {
-                self.until = total.saturating_add(left);
+                self.until = total.saturating_add(calls(&*self.course, left));
                 self.course.bring(&mut |slots, block| batch.load_part(number, slots, block));
                 None
             }

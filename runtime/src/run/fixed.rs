@@ -11,6 +11,8 @@ use std::ops::Range;
 
 /// Steps between two calls of the progress callback and two checks of the whole block.
 const BATCH: u64 = 4096;
+/// Most steps in one call if an observer needs every step: their values fit into the nearest cache.
+const SERIES: u64 = 64;
 
 /// A fixed-step run in progress.
 pub(crate) struct Fixed {
@@ -155,6 +157,25 @@ impl Stepper for Fixed {
             observer.see(instance)?;
         }
         Ok(None)
+    }
+
+    fn series(&self) -> Option<(&[Slot], u64)> {
+        let Observer { probe, .. } = &self.rest.observer;
+        let is_plain = self.each && probe.next().is_none();
+        is_plain.then(|| (self.rest.observer.slots(), (self.batch - self.full - self.done).min(SERIES)))
+    }
+
+    fn show(&mut self, calls: u64, values: &dyn Fn(u64, &mut [f64])) -> Result<(), Stop> {
+        let Rest { instance, observer, .. } = &mut self.rest;
+        let count = instance.get(Slot::COUNT);
+        for call in 0..calls {
+            let block = instance.block_mut();
+            values(call, block);
+            block[Slot::COUNT.index()] = count + (call + 1) as f64;
+            keep_time(block);
+            observer.see(instance)?;
+        }
+        Ok(())
     }
 
     fn take(&mut self, done: u64, status: u64) -> Result<(), Stop> {

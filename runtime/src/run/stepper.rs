@@ -5,7 +5,7 @@
 
 use crate::run::observe::Observer;
 use crate::run::outcome::{Continue, Stop, Work};
-use abi::{Function, Instance};
+use abi::{Function, Instance, Slot};
 use std::ops::Range;
 
 /// A run in progress.
@@ -16,6 +16,17 @@ pub(crate) trait Stepper {
     /// Continues to the next call of the function, and returns how often it is to be called at most. None at the end of
     /// the run. `watch` receives the fraction done and may stop the run.
     fn next(&mut self, watch: &mut dyn FnMut(f64) -> Continue) -> Result<Option<u64>, Stop>;
+
+    /// If this run reads its block after every call: the slots that it reads, and how many calls may be made before
+    /// [`take`](Stepper::take) if [`show`](Stepper::show) receives those slots after each call but the last.
+    fn series(&self) -> Option<(&[Slot], u64)> {
+        None
+    }
+
+    /// Receives such values: those after the first `calls` calls since the last `take`. All of these have returned 0.
+    fn show(&mut self, _calls: u64, _values: &dyn Fn(u64, &mut [f64])) -> Result<(), Stop> {
+        unreachable!("it has no series")
+    }
 
     /// Accepts the block after `done` calls, the last of which returned `status`; all others returned 0.
     fn take(&mut self, done: u64, status: u64) -> Result<(), Stop>;
