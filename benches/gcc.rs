@@ -11,7 +11,18 @@ pub fn built(source: &str) -> Library {
     library
 }
 
+/// The same for another target: `-mavx2 -mfma` in place of `-march=native`.
+#[allow(dead_code, reason = "most benches are for this processor")]
+pub fn built_for(source: &str, target: &[&str]) -> Library {
+    let library = room(source, &format!("{}.so", target.concat()));
+    let how = [&["-O3", "-shared", "-fPIC", "-Wall", "-Wextra", "-pedantic"], target].concat();
+    gcc("-std=gnu17", &library, &how, &[&in_benches(source)]);
+    // SAFETY: the library runs no code when it is loaded.
+    unsafe { Library::new(&library) }.expect("the library loads")
+}
+
 /// The same at several offsets in bytes.
+#[allow(dead_code, reason = "not every bench has several places")]
 pub fn built_at<const N: usize>(source: &str, leads: [usize; N]) -> [Library; N] {
     let object = room(source, "o");
     gcc("-c", &object, &["-O3", "-march=native", "-fPIC", "-Wall", "-Wextra", "-pedantic"], &[&in_benches(source)]);
