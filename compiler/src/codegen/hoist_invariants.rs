@@ -34,6 +34,8 @@ pub fn hoist_invariants(cfg: &mut Cfg) {
     cfg.blocks[head.index()].insts = rest;
     let prologue = &mut cfg.blocks[preheader.index()].insts;
     prologue.extend(hoisted);
-    // In the order of the straight line, in which operands precede their users.
+    // In the order of the straight line, in which operands precede their users. The preheader may compute the first
+    // value of a carried one from the same operations.
     prologue.sort_by_key(|inst| if let Inst::Compute(value) = inst { *value } else { unreachable!("{inst:?}") });
+    prologue.dedup();
 }

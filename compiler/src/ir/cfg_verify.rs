@@ -1,7 +1,7 @@
 //! Verifier of control-flow graphs: the properties that passes and the emitter rely on.
 //!
 //! In: a graph. Out: the first fault, as a message. On each path to a use, the value has been computed, read back or passed
-//! as a parameter; arguments fit parameters in number and type; a slot is loaded before it is stored; calls go to pieces.
+//! as a parameter; a block computes a value once; arguments fit parameters in number and type; a slot is loaded before it is stored; calls go to pieces.
 
 use super::cfg::{Area, BlockId, Cfg, Inst, Place, Terminator};
 use super::{Op, Type, Value, verify};
@@ -51,8 +51,12 @@ pub fn verify_cfg(cfg: &Cfg) -> Result<(), String> {
             }
             _ => {}
         }
+        let mut computed = BTreeSet::new();
         for inst in &block.insts {
             match inst {
+                Inst::Compute(value) if !computed.insert(*value) => {
+                    return fault(format!("{id} computes {value} twice"));
+                }
                 Inst::Call(piece) if *piece >= cfg.pieces.len() => return fault(format!("{id} calls piece {piece}")),
                 Inst::Store(Place { area: Area::Block, index, .. }, value) if types[value.index()] != Type::Real => {
                     return fault(format!("slot {index} holds reals, {value} is {:?}", types[value.index()]));
