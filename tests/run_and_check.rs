@@ -175,7 +175,7 @@ fn about_step(loaded: &mut Loaded, sources: &Texts, experiment: &str, method: Me
     let (options, mut found) = (Options { changes, interpret: true }, Vec::new());
     let result = compiler::compile(loaded, sources, experiment, &options, &mut found, &mut |_| ());
     found.extend(result.err().into_iter().flatten());
-    found.retain(|found| matches!(found.code, "E0702" | "W0704"));
+    found.retain(|found| matches!(found.code, "E0701" | "E0702" | "W0704"));
     found
 }
 
@@ -212,6 +212,9 @@ fn all_commands_name_one_largest_stable_step() {
         for factor in [1.1, 1.9] {
             let above = words(&about_step(&mut loaded, &sources, &experiment, method, factor * stable));
             let needed = stable_up_to(stable);
+            if above.contains("no multiple of the step") {
+                continue; // The steps of a sampled program divide its periods.
+            }
             assert!(
                 above.contains(&format!("a step of {needed}")),
                 "{name}, {} at {factor} of {stable}, {needed}: {above}",

@@ -22,11 +22,14 @@ use crate::numerics::autodiff;
 use crate::numerics::fixed_step;
 use abi::Slot;
 use abi::description::{Kind, Quantity};
+use abi::live::is_multiple;
 use abi::plan::Method;
 use std::cell::{OnceCell, RefCell};
 use std::ops::ControlFlow;
 use std::rc::Rc;
 
+/// Limit on the number of divisors of the shortest period that are tried for a step that divides the others as well.
+const MOST_PARTS: u32 = 1000;
 /// Limit on the number of continuous states of an analysed program.
 pub const MOST_STATES: usize = 48;
 /// Limit on interpreted operations for one result: some tenths of a second.
@@ -492,11 +495,24 @@ impl<'a> Bench<'a> {
             + 40 * self.n.pow(3)
     }
 
+    /// The largest step up to this one that divides all periods of sampled blocks, as a run requires of its step.
+    fn dividing(&self, h: f64) -> f64 {
+        let periods: Vec<f64> =
+            self.program.description.ticks.iter().map(|tick| self.base[tick.period.index()]).collect();
+        let shortest = periods.iter().copied().fold(f64::INFINITY, f64::min);
+        if !shortest.is_finite() || shortest <= 0.0 {
+            return h;
+        }
+        let first = (shortest / h).ceil().max(1.0);
+        let divides = |parts: f64| periods.iter().all(|period| is_multiple(*period, shortest / parts));
+        (0..MOST_PARTS).map(|more| first + f64::from(more)).find(|parts| divides(*parts)).map_or(h, |n| shortest / n)
+    }
+
     /// The largest step of a method in s for which [`unstable`](Self::unstable) finds nothing, searched upwards, because
     /// a step beyond the first unstable one is of no use.
     fn largest_stable(&self, method: Method) -> f64 {
         let stepper = self.stepper(method);
-        let stable = |h: f64| self.unstable_within(&stepper, method, h, SEARCH_WORK).is_none();
+        let stable = |h: f64| self.unstable_within(&stepper, method, self.dividing(h), SEARCH_WORK).is_none();
         if !stable(SHORTEST) {
             return 0.0;
         }
@@ -511,9 +527,10 @@ impl<'a> Bench<'a> {
                 if stable(middle) { low = middle } else { high = middle }
             }
         }
+        low = self.dividing(low);
         // A large model has more points than each step of this search examines.
         while low > SHORTEST && self.unstable_within(&stepper, method, low, WORK).is_some() {
-            low *= 0.95;
+            low = self.dividing(0.95 * low);
         }
         low
     }

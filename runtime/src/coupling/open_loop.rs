@@ -647,7 +647,13 @@ mod tests {
         assert!(found.stable && (gain.value - 6.0 / k).abs() < 1e-9, "{gain:?}");
         assert!((gain.frequency - 2f64.sqrt()).abs() < 1e-9, "{gain:?}");
         let bode = open.bode().unwrap();
-        assert!((bode[0].phase + 90.0).abs() < 5.0 && (bode.last().unwrap().phase + 270.0).abs() < 1.0);
+        assert!(bode.len() > 100 && bode[0].frequency < 1.0 && bode.last().unwrap().frequency > 2.0);
+        for point in bode {
+            let w = point.frequency;
+            let phase = -90.0 - w.atan().to_degrees() - (w / 2.0).atan().to_degrees();
+            let gain = k / (w * w.hypot(1.0) * w.hypot(2.0));
+            assert!((point.phase - phase).abs() < 1e-6 && (point.gain / gain - 1.0).abs() < 1e-9, "{point:?}");
+        }
     }
 
     #[test]
