@@ -4,8 +4,7 @@
 //! bits too.
 //!
 //! Mutants tried by hand, each fails with seed 2: a call that the interpreter began starts over once there is code; its
-//! rest is dropped. Of slices: the guards of ranges are left out too; the last step of a batch is a slice too; an
-//! output that is read is left out.
+//! rest is dropped.
 //!
 //! `FRIC_SEED`, `FRIC_RUNS` (default 120 runs).
 
