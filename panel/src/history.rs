@@ -272,7 +272,7 @@ mod tests {
         for offset in 0..200 {
             assert_eq!(history.columns(0, offset, 400, 50), whole[offset as usize..offset as usize + 400]);
         }
-        // What rises is told as rising: one polyline through all pairs is smooth.
+        // Pairs of a rising signal rise, so one polyline through all of them has no steps back.
         assert!(history.columns(1, 0, 600, 50).iter().all(|(a, b)| a < b));
     }
 

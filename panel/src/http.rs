@@ -37,7 +37,7 @@ pub struct Head {
 /// Reads a head.
 ///
 /// # Errors
-/// The end of the connection, or a refusal in its place.
+/// Of the connection. A head that is malformed, too long or too slow is answered with the inner error.
 pub fn head(stream: &mut TcpStream) -> io::Result<Result<Head, Answer>> {
     let begun = Instant::now();
     let mut bytes = Vec::new();

@@ -148,7 +148,7 @@ fn go_to_point(linear: &mut Linear, args: &Linearise) -> Result<(), String> {
 /// Relative tolerance of the search for rest.
 const REST_TOL: f64 = 1e-9;
 
-/// Moves the instance, which has started, to where nothing moves any more.
+/// Sets a started instance to an equilibrium, the rest state that it reaches by itself.
 fn come_to_rest(linear: &mut Linear) -> Result<(), String> {
     let mut from = linear.instance.adaptive().unwrap_or_else(|| linear.instance.clone());
     from.start(0.0);

@@ -5,7 +5,7 @@ use crate::{Panel, STICK_SLIP, folder, fric};
 use std::fs;
 use std::time::{Duration, Instant};
 
-/// What a screen reader is told of a canvas.
+/// The description of a canvas for screen readers.
 fn summary(page: &Page, canvas: usize) -> String {
     page.text(&format!(
         "document.querySelectorAll('.plot canvas[role=img]')[{canvas}].getAttribute('aria-label') ?? ''"

@@ -81,7 +81,7 @@ pub fn sides(of: &Expr) -> Option<[&Expr; 2]> {
     }
 }
 
-/// Whether an instance reads the recording in its arguments.
+/// Whether an argument of an instance, or of an instance in it, reads the recording.
 pub fn reads_recording(instance: &ast::Instance) -> bool {
     instance.args.iter().any(|bind| match &bind.value {
         ast::BindValue::Expr(expr) => reads(expr),

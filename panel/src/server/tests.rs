@@ -170,8 +170,8 @@ fn without_the_key_nothing_is_told_and_nothing_obeyed() {
     assert!(left && begun.elapsed().as_secs() < 8, "{:?}", begun.elapsed());
 }
 
-/// Whatever comes before the right key: whole frames of every kind, broken ones, and bytes that are no frames. Nothing of
-/// it is obeyed, nothing is told, and the panel serves on.
+/// Whatever comes before the right key: whole frames of every kind, broken ones, and bytes that are no frames. None of
+/// it is obeyed, the stranger receives no data, and the panel continues to serve.
 #[test]
 fn nothing_before_the_key_is_obeyed() {
     let open = open();

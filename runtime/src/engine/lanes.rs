@@ -225,7 +225,8 @@ impl<T> Lane<T> {
         watch: &mut dyn FnMut(f64) -> Continue,
     ) -> Option<Result<(), Stop>> {
         let done = total - std::mem::replace(&mut self.since, total);
-        // The last step is seen with all else in its block.
+        // The observer reads all steps of a series but the last one here. It reads the last one from the block, once that
+        // holds the other slots of the step too.
         if let Some((slots, _)) = self.course.series() {
             assert_eq!(slots, series.slots, "all runs in lanes read the same slots");
             if let Err(stop) = self.course.show(done - 1, &|step, block| series.read(step, number, block)) {

@@ -8,10 +8,10 @@ use crate::fit::unknowns::Elementary;
 /// Highest order.
 pub const MOST_ORDER: usize = 8;
 
-/// r(t) = Σ a(k) r(t − k) + e(t).
+/// An autoregressive model of residuals: r(t) = Σ a(k) r(t − k) + e(t).
 #[derive(Clone, PartialEq, Debug)]
 pub struct Noise {
-    /// The coefficients a(1), a(2), …; empty for white noise.
+    /// The autoregressive coefficients a(1), a(2), …; none for white noise.
     pub coefficients: Vec<f64>,
     /// Variance of the residuals.
     pub variance: f64,
