@@ -74,7 +74,7 @@ fn minisign() -> Command {
         return Command::new(installed);
     }
     let wanted = "signatures cannot be tried with the stock tool: there is no minisign";
-    let usr = debian::unpacked("minisign-tools", &["minisign", "libsodium23"], wanted).join("usr");
+    let usr = debian::unpacked("minisign-tools", &["minisign", "libsodium23"], &[], wanted).join("usr");
     let mut command = Command::new(usr.join("bin/minisign"));
     let library = fs::read_dir(usr.join("lib")).unwrap().next().expect("a folder of libraries").unwrap().path();
     command.env("LD_LIBRARY_PATH", library);

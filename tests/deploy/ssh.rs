@@ -19,7 +19,8 @@ fn server() -> (PathBuf, PathBuf) {
         return (installed.into(), "/usr/lib/openssh/sftp-server".into());
     }
     let packages = ["openssh-server", "openssh-sftp-server", "libwrap0"];
-    let usr = debian::unpacked("sshd-tools", &packages, "deployment cannot be tried: there is no sshd").join("usr");
+    let usr =
+        debian::unpacked("sshd-tools", &packages, &[], "deployment cannot be tried: there is no sshd").join("usr");
     (usr.join("sbin/sshd"), usr.join("lib/openssh/sftp-server"))
 }
 

@@ -3,23 +3,26 @@
 
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::process::Command;
+use std::process::{Command, Stdio};
 use std::sync::{Mutex, PoisonError};
 
-/// The folder of unpacked packages, from an earlier run or fetched now. `name`: of the folder. `wanted`: what cannot be
-/// tested without them, for the message.
+/// The folder of unpacked packages, from an earlier run or fetched now. `name`: of the folder. `omitted`: patterns of
+/// files that no test uses, where a package is large. `wanted`: what cannot be tested without them, for the message.
 #[allow(dead_code, reason = "not every test that shares this file")]
-pub fn unpacked(name: &str, packages: &[&str], wanted: &str) -> PathBuf {
-    fetched(name, packages, false, wanted)
+pub fn unpacked(name: &str, packages: &[&str], omitted: &[&str], wanted: &str) -> PathBuf {
+    fetched(name, packages, omitted, false, wanted)
 }
 
 /// The same of a package with those that it needs and this system lacks.
 #[allow(dead_code, reason = "not every test that shares this file")]
 pub fn unpacked_with_dependencies(name: &str, package: &str, wanted: &str) -> PathBuf {
-    fetched(name, &[package], true, wanted)
+    fetched(name, &[package], &[], true, wanted)
 }
 
-fn fetched(name: &str, packages: &[&str], dependencies: bool, wanted: &str) -> PathBuf {
+/// What no test reads in any package.
+const DOCUMENTATION: [&str; 4] = ["./usr/share/doc", "./usr/share/man", "./usr/share/locale", "./usr/share/info"];
+
+fn fetched(name: &str, packages: &[&str], omitted: &[&str], dependencies: bool, wanted: &str) -> PathBuf {
     // Tests of one binary run in parallel.
     static ONE: Mutex<()> = Mutex::new(());
     let _one = ONE.lock().unwrap_or_else(PoisonError::into_inner);
@@ -59,7 +62,13 @@ fn fetched(name: &str, packages: &[&str], dependencies: bool, wanted: &str) -> P
     assert!(fetched, "{wanted}, and apt-get cannot download {}", packages.join(" "));
     for archive in fs::read_dir(&archives).expect("it was just made").flatten() {
         if archive.path().extension().is_some_and(|extension| extension == "deb") {
-            done(Command::new("dpkg-deb").arg("-x").arg(archive.path()).arg(&begun), "dpkg-deb");
+            let mut package = Command::new("dpkg-deb");
+            package.arg("--fsys-tarfile").arg(archive.path()).stdout(Stdio::piped());
+            let mut package = package.spawn().unwrap_or_else(|error| panic!("dpkg-deb does not start: {error}"));
+            let files = package.stdout.take().expect("it is piped");
+            let omitted = DOCUMENTATION.iter().chain(omitted).map(|pattern| format!("--exclude={pattern}"));
+            done(Command::new("tar").arg("-xC").arg(&begun).args(omitted).stdin(files), "tar");
+            assert!(package.wait().is_ok_and(|status| status.success()), "dpkg-deb cannot read {:?}", archive.path());
         }
     }
     for folder in ["archives", "lists", "cache"] {
