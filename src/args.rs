@@ -627,6 +627,15 @@ pub struct Hil {
     /// Keep only the last ten seconds, written if the safety supervisor stops the rig
     #[arg(long, conflicts_with = "log")]
     pub no_log: bool,
+    /// Open a panel beside the rig, in a process of its own: curves, parameters, enable, arm and stop, in a browser
+    #[arg(long, conflicts_with_all = ["no_log", "fast", "check", "identify"])]
+    pub panel: bool,
+    /// Port of the panel on this computer; if it is taken, the next free one
+    #[arg(long, value_name = "PORT", requires = "panel", default_value_t = panel::server::PORT)]
+    pub port: u16,
+    /// Print the panel's link, and open no browser
+    #[arg(long, requires = "panel")]
+    pub no_open: bool,
     /// Seed of all random numbers of a simulation
     #[arg(long, value_name = "NUMBER", default_value_t = 1)]
     pub seed: u64,
@@ -955,6 +964,9 @@ pub struct Panel {
     /// Print the link, and open no browser
     #[arg(long)]
     pub no_open: bool,
+    /// The log is that of a rig that this process is beside: the section `started` of its head
+    #[arg(long, hide = true, conflicts_with = "save")]
+    pub of_rig: Option<String>,
     /// Write what the page would show into one HTML file that needs nothing else, and serve nothing
     #[arg(long, value_name = "FILE.html", value_hint = ValueHint::FilePath)]
     pub save: Option<PathBuf>,

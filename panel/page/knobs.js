@@ -31,15 +31,26 @@ function typed(knob, value) {
 }
 
 export class Knobs {
-  /** @param {HTMLElement} parent @param {Knob[]} knobs @param {(line: string, refused: (why: string) => void) => void} say */
-  constructor(parent, knobs, say) {
+  /**
+   * @param {HTMLElement} parent @param {Knob[]} knobs @param {(line: string, refused: (why: string) => void) => void} say
+   * @param {boolean} stages whether a touch only prepares a change, and all are sent together
+   */
+  constructor(parent, knobs, say, stages = false) {
     this.knobs = knobs;
+    this.stages = stages;
+    /** Changes that were prepared, as text. @type {Map<number, string>} */
+    this.staged = new Map();
+    this.onstaged = () => {};
     // JSON has no infinity: a value without end is null.
     for (const knob of knobs) knob.own = knob.own ?? Infinity;
     this.values = knobs.map(knob => knob.own);
+    /** What the panel has. */
+    this.actual = [...this.values];
     /** The values before each touch. @type {number[][]} */
     this.before = [];
     this.touched = -1;
+    /** The field that is being typed in. */
+    this.editing = -1;
     this.live = true;
     this.onundo = () => {};
     this.say = say;
@@ -68,8 +79,16 @@ export class Knobs {
     const field = document.createElement('input');
     field.id = `field-${i}`;
     label.htmlFor = field.id;
+    const now = document.createElement('p');
+    now.className = 'now';
+    now.hidden = true;
     const send = (/** @type {string} */ text) => {
       refused.hidden = true;
+      if (this.stages) {
+        this.staged.set(i, text);
+        this.show(i);
+        return this.onstaged();
+      }
       this.say(`set ${knob.path} = ${text}`, why => {
         refused.textContent = why;
         refused.hidden = false;
@@ -83,28 +102,49 @@ export class Knobs {
         send(String(field.checked));
       };
       top.append(label, field);
-      root.append(top, refused);
-      return { root, field, slider: null, refused, send };
+      root.append(top, now, refused);
+      return { root, field, slider: null, refused, now, send };
     }
     field.type = 'text';
     field.autocomplete = 'off';
     field.spellcheck = false;
     field.setAttribute('aria-describedby', refused.id);
+    // A bare number is in the unit that stands beside it.
+    const text = () => {
+      const bare = field.value.trim() !== '' && Number.isFinite(Number(field.value.replace('−', '-')));
+      return bare ? typed(knob, Number(field.value.replace('−', '-'))) : field.value.trim();
+    };
+    field.oninput = () => { this.editing = i; };
     field.onkeydown = event => {
       if (event.key === 'Enter') {
-        this.touch(i);
-        this.release();
-        // A bare number is in the unit that stands beside it.
-        const bare = field.value.trim() !== '' && Number.isFinite(Number(field.value.replace('−', '-')));
-        send(bare ? typed(knob, Number(field.value.replace('−', '-'))) : field.value.trim());
+        const edited = this.editing === i;
+        this.editing = -1;
+        if (this.stages) {
+          if (edited) send(text());
+          this.apply();
+        } else {
+          this.touch(i);
+          this.release();
+          send(text());
+        }
       }
-      if (event.key === 'Escape') this.show(i);
+      if (event.key === 'Escape') {
+        this.editing = -1;
+        this.show(i);
+      }
     };
-    field.onblur = () => this.show(i);
+    field.onchange = () => {
+      if (this.stages && this.editing === i) send(text());
+      this.editing = -1;
+    };
+    field.onblur = () => {
+      this.editing = -1;
+      this.show(i);
+    };
     if (!Number.isFinite(knob.own)) {
       top.append(label, field);
-      root.append(top, refused);
-      return { root, field, slider: null, refused, send };
+      root.append(top, now, refused);
+      return { root, field, slider: null, refused, now, send };
     }
     const slider = document.createElement('input');
     slider.type = 'range';
@@ -133,8 +173,8 @@ export class Knobs {
     };
     slider.onkeyup = event => { if (event.key.startsWith('Arrow')) { if (!this.live) moved(true); this.release(); } };
     top.append(label, field);
-    root.append(top, slider, refused);
-    return { root, field, slider, refused, send };
+    root.append(top, slider, now, refused);
+    return { root, field, slider, refused, now, send };
   }
 
   /** Before a change: remembers the values for undo, once a touch. @param {number} i */
@@ -150,7 +190,28 @@ export class Knobs {
     this.touched = -1;
   }
 
+  /** Sends what was prepared, as one set. Then each control shows what the rig has. */
+  apply() {
+    if (this.staged.size === 0) return;
+    const text = [...this.staged].map(([i, value]) => `${this.knobs[i].path} = ${value}`).join(', '), rows = [...this.staged.keys()];
+    this.say(`set ${text}`, why => {
+      const { refused } = this.rows[rows[0]];
+      refused.textContent = why;
+      refused.hidden = false;
+    });
+    this.discard();
+  }
+
+  /** Forgets what was prepared. */
+  discard() {
+    this.staged.clear();
+    this.touched = -1;
+    this.follow([...this.actual]);
+    this.onstaged();
+  }
+
   undo() {
+    if (this.stages) return this.discard();
     const values = this.before.pop();
     this.onundo();
     if (!values) return;
@@ -163,22 +224,34 @@ export class Knobs {
   /** The values that the panel has; a control under the hand does not follow. @param {number[]} values */
   follow(values) {
     values.forEach((value, i) => {
+      this.actual[i] = value ?? Infinity;
+      if (this.staged.has(i)) return this.show(i);
       if (i === this.touched && this.rows[i].slider) return;
       this.values[i] = value ?? Infinity;
       this.show(i);
     });
   }
 
+  /** What stands in a field. @param {number} i */
+  text(i) {
+    return this.staged.get(i) ?? `${number(this.values[i], 5)} ${this.knobs[i].unit}`.trim();
+  }
+
   /** @param {number} i */
   show(i) {
-    const { root, field, slider } = this.rows[i], knob = this.knobs[i], value = this.values[i];
-    root.classList.toggle('changed', value !== knob.own && !(Math.abs(value - knob.own) <= 1e-12 * Math.abs(knob.own)));
+    const { root, field, slider, now } = this.rows[i], knob = this.knobs[i], value = this.values[i];
+    root.classList.toggle('changed', this.staged.has(i) || value !== knob.own && !(Math.abs(value - knob.own) <= 1e-12 * Math.abs(knob.own)));
+    now.hidden = !this.staged.has(i);
+    if (!now.hidden) {
+      const text = words.now(knob.boolean ? String(this.actual[i] !== 0) : `${number(this.actual[i], 5)} ${knob.unit}`.trim());
+      if (now.textContent !== text) now.textContent = text;
+    }
     if (knob.boolean) {
-      field.checked = value !== 0;
+      if (!this.staged.has(i)) field.checked = value !== 0;
       return;
     }
-    const text = `${number(value, 5)} ${knob.unit}`.trim();
-    if (document.activeElement !== field || this.touched === i) field.value = text;
+    const text = this.text(i);
+    if (this.editing !== i && field.value !== text) field.value = text;
     if (slider) {
       if (this.touched !== i) slider.value = String(position(knob, value));
       slider.setAttribute('aria-valuetext', text);

@@ -2,9 +2,29 @@
 import { words } from './words.js';
 
 /**
- * A curve as points; x in s or in the unit of its signal.
- * @typedef {{ view: number, curve: number, x: Float64Array, y: Float64Array }} Curve
+ * A curve as points; x in s or in the unit of its signal. One in columns says which: `cycles` of each, the `first` one.
+ * @typedef {{ view: number, curve: number, x: Float64Array, y: Float64Array, cycles?: number, first?: number }} Curve
  */
+
+/**
+ * A curve with the newer columns of the same width in the place of its own from there on; those before `from` s are left
+ * out. Where the columns do not touch, what lies between has left the window, and so have the older ones.
+ * @param {Curve | undefined} old @param {Curve} fresh @param {number} from @returns {Curve}
+ */
+export function joined(old, fresh, from) {
+  if (!old || !fresh.cycles || old.cycles !== fresh.cycles || fresh.first === undefined || old.first === undefined || fresh.first <= old.first
+    || fresh.first > old.first + old.x.length / 2) return fresh;
+  const end = Math.min(2 * (fresh.first - old.first), old.x.length);
+  let begin = 0;
+  while (begin + 2 < end && old.x[begin + 2] < from) begin += 2;
+  const both = (/** @type {Float64Array} */ a, /** @type {Float64Array} */ b) => {
+    const out = new Float64Array(end - begin + b.length);
+    out.set(a.subarray(begin, end));
+    out.set(b, end - begin);
+    return out;
+  };
+  return { ...fresh, first: old.first + begin / 2, x: both(old.x, fresh.x), y: both(old.y, fresh.y) };
+}
 
 /** Reads a frame. @param {ArrayBuffer} buffer @param {number} period @returns {{ number: number, newest: number, curves: Curve[] }} */
 export function decode(buffer, period) {
@@ -29,7 +49,7 @@ export function decode(buffer, period) {
         y[2 * i] = base + pairs[2 * i];
         y[2 * i + 1] = base + pairs[2 * i + 1];
       }
-      curves.push({ view: id, curve, x, y });
+      curves.push({ view: id, curve, x, y, cycles, first });
     } else {
       const x = new Float64Array(count), y = new Float64Array(count);
       for (let i = 0; i < count; i++) {

@@ -1,8 +1,11 @@
 // Puts the page together.
 import { words, number } from './words.js';
-import { decode, connect, embedded } from './link.js';
+import { decode, connect, embedded, joined } from './link.js';
 import { Plot, COLOURS, DASHES, sample, valueAt, bars } from './plot.js';
 import { Knobs } from './knobs.js';
+
+/** Seconds that are shown of what still grows. */
+const LAST = 20;
 
 const element = (/** @type {string} */ id) => /** @type {HTMLElement} */ (document.getElementById(id));
 const input = (/** @type {string} */ id) => /** @type {HTMLInputElement} */ (document.getElementById(id));
@@ -10,6 +13,12 @@ const input = (/** @type {string} */ id) => /** @type {HTMLInputElement} */ (doc
 let /** @type {any} */ hello = null, /** @type {any} */ state = null;
 /** The window of time; null: all. @type {[number, number] | null} */
 let window_ = null;
+/** Seconds up to the newest, while more comes; null: the window stands. @type {number | null} */
+let newest = null;
+/** What the window was before it was held. */
+let before = LAST;
+/** The end of the data in the latest frame, s. */
+let end = 0;
 /** @type {{ plot: Plot, canvas: any, curves: Map<number, any> }[]} */
 let plots = [];
 let /** @type {Knobs | null} */ knobs = null;
@@ -33,6 +42,7 @@ function message(what) {
     const refuse = refusals.get(what.number);
     refusals.delete(what.number);
     if (what.refused) (refuse ?? (why => problem(why)))(what.refused);
+    else if (hello?.kind === 'rig') problem(null);
   }
 }
 
@@ -57,6 +67,43 @@ function problem(text) {
   if (text && place.textContent !== text) place.textContent = text;
 }
 
+/** A command to a rig, with the picture that was seen. @param {string} line @param {(why: string) => void} refused */
+function command(line, refused) {
+  say(`@${end} ${line}`, refused);
+}
+
+let /** @type {any} */ unconfirmed = 0;
+
+/** Stops the rig: always, whatever is shown or under way. */
+function stop() {
+  say('stop', problem);
+  clearTimeout(unconfirmed);
+  unconfirmed = setTimeout(() => { if (!state?.over && /^(armed|wait|enab|test)/.test(state?.stage ?? 'armed')) problem(words.notConfirmed); }, 500);
+}
+
+let sureUntil = 0;
+
+/** The next step of a rig. Arm wants a second press. */
+function next() {
+  const step = state?.next;
+  if (step === 'arm' && performance.now() > sureUntil) {
+    sureUntil = performance.now() + 3000;
+    setTimeout(steps, 3010);
+    return steps();
+  }
+  sureUntil = 0;
+  if (step === 'enable' || step === 'arm') command(step, problem);
+  steps();
+}
+
+function steps() {
+  const step = /** @type {'enable' | 'arm' | '-'} */ (state?.next ?? '-'), place = element('next'), sure = performance.now() < sureUntil;
+  place.hidden = hello?.kind !== 'rig' || step === '-' || !!saved;
+  if (step === '-') return;
+  place.textContent = (sure ? words.sure : words.next)[step];
+  place.classList.toggle('sure', sure);
+}
+
 /** A line that may be refused. @param {string} line @param {(why: string) => void} refused */
 function say(line, refused) {
   refusals.set(link.say(line), refused);
@@ -69,6 +116,8 @@ function begin(/** @type {any} */ is) {
   frames = [];
   hello = is;
   window_ = null;
+  newest = hello.grows ? LAST : null;
+  end = hello.to;
   element('title').textContent = hello.title;
   const choices = element('choices');
   choices.setAttribute('aria-label', words.experiments);
@@ -89,12 +138,22 @@ function begin(/** @type {any} */ is) {
   plots.forEach(names);
   const unit = element('knobs');
   unit.hidden = hello.knobs.length === 0 || !!saved;
-  knobs = unit.hidden ? null : new Knobs(element('rows'), hello.knobs, say);
+  const rig = hello.kind === 'rig';
+  knobs = unit.hidden ? null : new Knobs(element('rows'), hello.knobs, rig ? command : say, rig);
+  for (const id of ['undo', 'text', 'kept', 'copy']) element(id).hidden = rig;
+  element('stages').hidden = !rig;
+  element('stop').hidden = !rig || !!saved;
+  if (knobs) knobs.onstaged = () => {
+    const n = knobs?.staged.size ?? 0;
+    element('apply').textContent = words.apply(n);
+    for (const id of ['apply', 'discard']) /** @type {HTMLButtonElement} */ (element(id)).disabled = n === 0;
+  };
+  knobs?.onstaged();
   if (knobs) {
     knobs.onundo = () => { /** @type {HTMLButtonElement} */ (element('undo')).disabled = knobs?.before.length === 0; };
     knobs.onundo();
   }
-  events();
+  listed = '';
   if (saved) for (const one of plots) for (const curve of link.saved) place(one, curve, true);
   asked = false;
   resize();
@@ -166,15 +225,22 @@ function names(one) {
   }));
 }
 
+/** All there is. @returns {[number, number]} */
+function all() {
+  return [state?.from ?? hello.from, Math.max(end, state?.to ?? hello.to)];
+}
+
 /** The window that is shown. @returns {[number, number]} */
 function span() {
-  return window_ ?? [hello.from, state?.to ?? hello.to];
+  const [from, to] = all();
+  // What is shorter fills the picture.
+  return newest ? [Math.min(Math.max(from, to - newest), to - 1e-3), to] : window_ ?? [from, to];
 }
 
 /** Asks for the curves of all canvases, once they have their size. */
 function ask() {
   plots.forEach((one, id) => {
-    const { signals, against } = one.canvas, at = window_ ? `${window_[0]} ${window_[1]}` : 'all';
+    const { signals, against } = one.canvas, at = newest ? `last ${newest}` : window_ ? `${window_[0]} ${window_[1]}` : 'all';
     if (against === null) link.send(`view ${id} ${signals.join(',')} ${at} ${one.plot.columns()}`);
     else link.send(`path ${id} ${against},${signals[0]} ${at}`);
   });
@@ -183,19 +249,41 @@ function ask() {
 
 /** @param {[number, number] | null} to */
 function move(to) {
-  const [from, end] = [hello.from, state?.to ?? hello.to], least = 1e-6 * (end - from);
+  const [from, last] = all(), least = 1e-6 * (last - from);
   if (to) {
-    const width = Math.min(Math.max(to[1] - to[0], least), end - from);
-    const begin = Math.min(Math.max(to[0], from), end - width);
-    to = width >= end - from ? null : [begin, begin + width];
+    const width = Math.min(Math.max(to[1] - to[0], least), last - from);
+    const begin = Math.min(Math.max(to[0], from), last - width);
+    // While more comes, all is more and more: a window stands.
+    to = width >= last - from && !state?.grows ? null : [begin, begin + width];
   }
   window_ = to;
+  if (newest) before = newest;
+  newest = null;
   asked = false;
   wake();
 }
 
+/** Follows the newest, this long. @param {number} seconds */
+function now(seconds) {
+  newest = Math.min(Math.max(seconds, 1e-3), 1e6);
+  window_ = null;
+  asked = false;
+  wake();
+}
+
+/** Back to the begin: the newest of what still grows, otherwise all. */
+function home() {
+  if (state?.grows) now(LAST); else move(null);
+}
+
+/** Holds the picture while more comes; and lets it go on. */
+function hold() {
+  if (newest) move(span()); else if (state?.grows) now(before);
+}
+
 /** @param {number} factor @param {number} [about] */
 function zoom(factor, about) {
+  if (newest) return now(newest * factor);
   const [from, to] = span(), middle = about ?? (from + to) / 2;
   move([middle - (middle - from) * factor, middle + (to - middle) * factor]);
 }
@@ -215,21 +303,37 @@ function follow(plot) {
   canvas.onpointermove = event => {
     if (held) {
       const by = plot.fromX(held.x) - plot.fromX(x(event));
-      if (window_) move([held.span[0] + by, held.span[1] + by]);
+      if ((window_ || newest) && by !== 0) move([held.span[0] + by, held.span[1] + by]);
     }
     pointer = plot.fromX(x(event));
     wake();
   };
   canvas.onpointerleave = () => { pointer = null; wake(); };
-  canvas.ondblclick = () => move(null);
+  canvas.ondblclick = home;
 }
 
 function events() {
-  const all = hello.events ?? [];
-  element('events').hidden = hello.kind !== 'recording';
-  element('happened').replaceChildren(...(all.length ? all : []).map((/** @type {any} */ event) => {
+  const happened = state?.events ?? [], late = state?.late;
+  element('events').hidden = hello.kind === 'what if';
+  if (JSON.stringify(happened) !== listed) list(happened);
+  element('late').hidden = !late;
+  if (late) {
+    element('late-name').textContent = words.late;
+    bars(element('bars'), late, hello.period);
+    element('late-words').textContent = words.lateWords(late);
+  }
+}
+/** The answer that was shown last. */
+let answered = 0;
+/** The events that are listed, as text. */
+let listed = '';
+
+/** @param {any[]} happened */
+function list(happened) {
+  listed = JSON.stringify(happened);
+  element('happened').replaceChildren(...happened.map((/** @type {any} */ event) => {
     const item = document.createElement('li'), made = button('', () => {
-      const width = Math.min((hello.to - hello.from) / 4, 2);
+      const width = Math.min((all()[1] - all()[0]) / 4, 2);
       move([event.t - width / 2, event.t + width / 2]);
     });
     const time = document.createElement('b');
@@ -238,33 +342,35 @@ function events() {
     item.append(made);
     return item;
   }));
-  if (!all.length) element('happened').textContent = words.nothing;
-  element('late').hidden = !hello.late;
-  if (hello.late) {
-    element('late-name').textContent = words.late;
-    bars(element('bars'), hello.late, hello.period);
-    const text = document.createElement('p');
-    text.textContent = words.lateWords(hello.late);
-    element('late').querySelector('p')?.remove();
-    element('late').append(text);
-  }
+  if (!happened.length) element('happened').textContent = words.nothing;
 }
 
 /** Shows what the panel says of itself. */
 function show() {
   if (!hello || !state) return;
   document.body.classList.remove('lost');
-  problem(state.problem ?? null);
-  if (hello.kind === 'recording') {
-    sentence('good', words.recording(state));
+  if (hello.kind !== 'rig' || state.problem) problem(state.problem ?? null);
+  if (hello.kind !== 'what if') {
+    const rig = hello.kind === 'rig', asked = /^ended as asked/.test(state.over ?? '');
+    const bad = rig && (state.over ? !asked : /^(stopped|refused|quick stop|torque off)/.test(state.stage));
+    sentence(bad ? 'bad' : rig && state.stage !== 'armed' ? 'old' : 'good', rig ? words.rig(state) : words.recording(state));
+    if (rig) {
+      steps();
+      if (state.answer && state.answer.number !== answered) {
+        answered = state.answer.number;
+        if (state.answer.refused) problem(words.answered(state.answer));
+      }
+    }
+    events();
+    if (newest && hello.grows && state.grows === false) move(span());
   } else {
     const failures = state.run?.failures ?? [];
     const failed = failures.length > 0 || (state.run?.verdicts ?? []).some((/** @type {any} */ v) => !v.holds);
     sentence(failed ? 'bad' : 'good', failures.length ? words.failed(failures) : words.running(hello, state.run));
   }
-  if (knobs) {
+  knobs?.follow(state.values);
+  if (knobs && hello.kind === 'what if') {
     knobs.live = state.short;
-    knobs.follow(state.values);
     input('set').value = state.set || words.none;
     /** @type {HTMLButtonElement} */ (element('copied')).disabled = !state.set;
     /** @type {HTMLButtonElement} */ (element('text')).disabled = !state.set;
@@ -315,7 +421,7 @@ function resize() {
   let changed = false;
   plots.forEach(one => { changed = one.plot.fit() || changed; });
   if (changed) asked = false;
-  if (hello?.late) bars(element('bars'), hello.late, hello.period);
+  if (state?.late) bars(element('bars'), state.late, hello.period);
   wake();
 }
 
@@ -336,7 +442,11 @@ function draw() {
   for (const buffer of frames) {
     const frame = decode(buffer, hello.period ?? 0);
     last = frame.number;
-    for (const curve of frame.curves) plots[curve.view]?.curves.set(curve.curve, curve);
+    end = frame.newest;
+    for (const curve of frame.curves) {
+      const curves = plots[curve.view]?.curves;
+      curves?.set(curve.curve, joined(curves.get(curve.curve), curve, span()[0]));
+    }
   }
   frames = [];
   if (!asked && !saved) ask();
@@ -361,7 +471,7 @@ function picture(one) {
   // The latest run on top.
   lines.sort((a, b) => Number(b.ghost) - Number(a.ghost));
   plot.draw(lines, plot.plane ? null : span());
-  if (!plot.plane) plot.drawMarks(pointer, hello.events ?? [], cursorTimes() ?? []);
+  if (!plot.plane) plot.drawMarks(pointer, state.events ?? [], cursorTimes() ?? []);
   for (const item of plot.names.children) {
     const own = /** @type {HTMLElement} */ (item), curve = one.curves.get(Number(own.dataset.curve)), value = own.querySelector('b');
     if (!curve || !value) continue;
@@ -497,6 +607,12 @@ function start() {
   element('events-name').textContent = words.events;
   element('table-name').textContent = words.table;
   element('keys').textContent = words.keys;
+  element('stop').textContent = words.stop;
+  element('stop').onclick = stop;
+  element('next').onclick = next;
+  element('apply').onclick = () => knobs?.apply();
+  element('discard').textContent = words.discard;
+  element('discard').onclick = () => knobs?.discard();
   element('undo').textContent = words.undo;
   element('undo').onclick = () => knobs?.undo();
   element('text').textContent = words.asText;
@@ -516,14 +632,17 @@ function start() {
   measures.id = 'measure';
   shown.id = 'legend';
   shown.className = 'legend';
-  tools.append(button(words.whole, () => move(null)), button(words.closer, () => zoom(0.5)), button(words.wider, () => zoom(2)), values, measures, shown);
+  tools.append(button(words.whole, () => move(null)), button(words.newest, home), button(words.closer, () => zoom(0.5)), button(words.wider, () => zoom(2)), values, measures, shown);
   addEventListener('keydown', event => {
     const target = /** @type {HTMLElement} */ (event.target);
+    if (event.key === 'Escape' && hello?.kind === 'rig') return stop();
     if (!hello || event.ctrlKey || event.metaKey || event.altKey || target.tagName === 'INPUT' && /** @type {HTMLInputElement} */ (target).type === 'text' || target.id === 'set') return;
+    // A button takes its own space bar.
+    if (event.key === ' ' && target.closest('button, input')) return;
     const [from, to] = span(), by = 0.2 * (to - from);
     const act = {
-      '+': () => zoom(0.5), '=': () => zoom(0.5), '-': () => zoom(2), Home: () => move(null), t: toggleTable, c: toggleCursors, u: () => knobs?.undo(),
-      ArrowLeft: () => window_ && move([from - by, to - by]), ArrowRight: () => window_ && move([from + by, to + by]),
+      '+': () => zoom(0.5), '=': () => zoom(0.5), '-': () => zoom(2), Home: home, ' ': hold, t: toggleTable, c: toggleCursors, u: () => knobs?.undo(),
+      ArrowLeft: () => (window_ || newest) && move([from - by, to - by]), ArrowRight: () => window_ && move([from + by, to + by]),
     }[event.key];
     if (act) {
       event.preventDefault();

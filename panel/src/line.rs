@@ -5,7 +5,8 @@
 //!
 //! ```text
 //! key KEY                                 first message of a socket
-//! view ID SIGNAL,… FROM TO COLUMNS        curves over time, s; `all` in place of FROM TO: everything there is
+//! view ID SIGNAL,… FROM TO COLUMNS        curves over time, s; `all` in place of FROM TO: everything there is;
+//!                                         `last SECONDS`: the newest, also while more comes
 //! path ID SIGNAL,SIGNAL FROM TO           the second over the first
 //! drop ID                                 of either
 //! ack FRAME                               this frame is drawn
@@ -21,8 +22,27 @@ pub const COLUMNS: u32 = 4096;
 /// Most bytes of a message.
 pub const LONGEST: usize = 4096;
 
-/// A window of time in s; none: all there is.
-pub type Window = Option<(f64, f64)>;
+/// A window of time, s.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub enum Window {
+    /// All there is.
+    All,
+    /// From one time to a later one.
+    Span(f64, f64),
+    /// This long, up to the newest.
+    Last(f64),
+}
+
+impl Window {
+    /// Its ends in data from `begin` to `end`.
+    pub fn within(self, begin: f64, end: f64) -> (f64, f64) {
+        match self {
+            Window::All => (begin, end),
+            Window::Span(from, to) => (from, to),
+            Window::Last(seconds) => (end - seconds, end),
+        }
+    }
+}
 
 /// What a page wants to see.
 #[derive(Clone, PartialEq, Debug)]
@@ -103,15 +123,22 @@ fn view(id: &str, signals: &str, window: &[&str], columns: Option<u32>) -> Resul
         return Err(format!("a view has at most {SIGNALS} signals"));
     }
     let window = match window {
-        ["all"] => None,
+        ["all"] => Window::All,
+        ["last", seconds] => {
+            let seconds: f64 = number(seconds, "a time in s")?;
+            if !(seconds.is_finite() && seconds > 0.0) {
+                return Err(format!("the newest part lasts longer than 0 s, not {seconds} s"));
+            }
+            Window::Last(seconds)
+        }
         [from, to] => {
             let (from, to): (f64, f64) = (number(from, "a time in s")?, number(to, "a time in s")?);
             if !(from.is_finite() && to.is_finite() && from < to) {
                 return Err(format!("a window goes from one time to a later one, not from {from} to {to}"));
             }
-            Some((from, to))
+            Window::Span(from, to)
         }
-        _ => return Err("a window is `all`, or FROM TO in s".into()),
+        _ => return Err("a window is `all`, `last SECONDS`, or FROM TO in s".into()),
     };
     Ok(View { id, signals, window, columns })
 }
@@ -125,9 +152,10 @@ mod tests {
         let view =
             |id, signals: &[u32], window, columns| Line::View(View { id, signals: signals.to_vec(), window, columns });
         assert_eq!(read("key 0123"), Ok(Line::Key("0123")));
-        assert_eq!(read("view 2 0,3,7 all 1200"), Ok(view(2, &[0, 3, 7], None, Some(1200))));
-        assert_eq!(read("view 0 4 -1.5 2e1 600"), Ok(view(0, &[4], Some((-1.5, 20.0)), Some(600))));
-        assert_eq!(read("path 5 1,2 0 10"), Ok(view(5, &[1, 2], Some((0.0, 10.0)), None)));
+        assert_eq!(read("view 2 0,3,7 all 1200"), Ok(view(2, &[0, 3, 7], Window::All, Some(1200))));
+        assert_eq!(read("view 0 4 -1.5 2e1 600"), Ok(view(0, &[4], Window::Span(-1.5, 20.0), Some(600))));
+        assert_eq!(read("path 5 1,2 0 10"), Ok(view(5, &[1, 2], Window::Span(0.0, 10.0), None)));
+        assert_eq!(read("view 1 2 last 24 600"), Ok(view(1, &[2], Window::Last(24.0), Some(600))));
         assert_eq!(read("ack 17"), Ok(Line::Ack(17)));
         assert_eq!(read("drop 3\n"), Ok(Line::Drop(3)));
         assert_eq!(read("12 set fr.Fs = 0.31 N, m = 2 kg"), Ok(Line::Say(12, "set fr.Fs = 0.31 N, m = 2 kg")));
@@ -152,6 +180,9 @@ mod tests {
             ("view 1 0 0 inf 10", "from one time to a later one"),
             ("view 1 0 nan 1 10", "from one time to a later one"),
             ("view 1 0 1 10", "a window is `all`"),
+            ("view 1 0 last 0 10", "longer than 0 s"),
+            ("view 1 0 last inf 10", "longer than 0 s"),
+            ("view 1 0 last 10", "a window is `all`"),
             ("path 1 0 all", "a path has two signals"),
             ("path 1 0,1,2 all", "a path has two signals"),
             ("ack -1", "`-1` is not the number of a frame"),
@@ -176,6 +207,7 @@ mod tests {
             "drop",
             "ack",
             "all",
+            "last",
             "0",
             "1",
             "31",
@@ -213,7 +245,11 @@ mod tests {
                     assert!(view.id < VIEWS && view.signals.len() <= SIGNALS, "seed {seed}: {line}");
                     assert!(view.columns.is_none_or(|n| (1..=COLUMNS).contains(&n)), "seed {seed}: {line}");
                     assert!(view.columns.is_some() || view.signals.len() == 2, "seed {seed}: {line}");
-                    let window = view.window.map_or("all".into(), |(from, to)| format!("{from} {to}"));
+                    let window = match view.window {
+                        Window::All => "all".into(),
+                        Window::Span(from, to) => format!("{from} {to}"),
+                        Window::Last(seconds) => format!("last {seconds}"),
+                    };
                     let signals: Vec<String> = view.signals.iter().map(u32::to_string).collect();
                     let (id, signals) = (view.id, signals.join(","));
                     match view.columns {

@@ -1,5 +1,6 @@
 //! `fric hil`: runs a rig with drives on its buses, real or simulated.
 
+use super::beside::Beside;
 use super::prompt::{Rehearsal, prompt};
 use super::{End, chosen_rig, load_from};
 use crate::args::Hil as Args;
@@ -282,6 +283,21 @@ fn run(
     let log_path = log.as_ref().map(|(settings, _)| match &settings.sink {
         Sink::File(path, _) | Sink::BlackBox(path, _) => path.clone(),
     });
+    // Before the calling thread is set up for real time.
+    let beside = match (args.panel, &log, &log_path) {
+        (true, Some((_, head)), Some(path)) => {
+            let started = head.text("started").unwrap_or_default();
+            match Beside::start(path, started, args.port, args.no_open) {
+                Ok(beside) => Some(beside),
+                Err(why) => {
+                    terminal.error(&why);
+                    return End::Failed;
+                }
+            }
+        }
+        _ => None,
+    };
+    let told = beside.as_ref().map(Beside::told);
     let started = hil_options(args, &ready, drives).and_then(|mut options| {
         if let Some(asked) = asked {
             options.duration_ns = Some(asked.duration_ns);
@@ -302,6 +318,7 @@ fn run(
     let mut session = match started {
         Ok(session) => session,
         Err(why) => {
+            told.iter().for_each(|told| told.over(&why));
             terminal.error(&why);
             return End::Failed;
         }
@@ -316,8 +333,12 @@ fn run(
         let (gauges, rig, over) = (session.hil.gauges(), rig.clone(), over.clone());
         std::thread::spawn(move || view(&gauges, &rig, &over))
     });
+    let telling = told.clone().map(|told| {
+        let (gauges, over) = (session.hil.gauges(), over.clone());
+        std::thread::spawn(move || Beside::tell(&told, &gauges, &over))
+    });
     if let Some(operator) = session.operator().filter(|_| !drives.is_fast()) {
-        std::thread::spawn(move || prompt(operator.by_the_wall(), rehearsal));
+        std::thread::spawn(move || prompt(operator.by_the_wall(), rehearsal, beside));
     }
     if let Some(asked) = asked {
         let rows = identify::rows(&mut session.hil, asked);
@@ -330,10 +351,21 @@ fn run(
     if let Some(view) = view {
         let _ = view.join();
     }
+    if let Some(telling) = telling {
+        let _ = telling.join();
+    }
     if session.hil.is_checked() {
         checked(rig, &session.hil, terminal);
     }
-    finish(args, session.finish(), end, log_path, terminal)
+    let finished = session.finish();
+    if let Some(told) = told {
+        told.over(&match &end {
+            cycle::End::Asked => "ended as asked".to_string(),
+            cycle::End::Refused(why) => format!("refused: {why}"),
+            cycle::End::Stopped(_, why) => format!("stopped: {why}"),
+        });
+    }
+    finish(args, finished, end, log_path, terminal)
 }
 
 /// Prints what `--check` found for each drive, and that there were no problems.

@@ -13,6 +13,7 @@ mod doctor;
 mod drives;
 mod explain;
 mod fmt;
+mod beside;
 mod prompt;
 mod hil;
 mod inspect;

@@ -6,27 +6,35 @@ use crate::commands::shared::rig_log::{self, Opened};
 use crate::compile::Options;
 use crate::interrupt::on_interrupt;
 use crate::project;
-use crate::shown::recording::Recording;
+use crate::shown::operated::Operated;
+use crate::shown::recording::{Played, Recording};
 use crate::shown::what_if::WhatIf;
 use crate::terminal::Terminal;
 use panel::report::report;
 use panel::server::{Bell, Panel};
 use panel::subject::Subject;
-use runtime::record::blocks::MAGIC;
+use runtime::record::blocks::{End as LogEnd, MAGIC};
+use runtime::record::claim::is_claimed;
+use runtime::record::log::Reader;
 use std::fs::File;
-use std::io::{Read, Write};
+use std::io::{BufRead, Read, Write};
 use std::path::Path;
 use std::process::{Command, Stdio};
 use std::sync::Arc;
 use std::sync::mpsc;
+use std::time::{Duration, Instant};
 
+/// Polling interval of a log that grows: its writer appends to it ten times a second.
+const LOOK: Duration = Duration::from_millis(20);
+/// Time for which the panel of a rig that has ended waits for a page.
+const REMAINS: Duration = Duration::from_secs(5);
 /// Columns of a recording's report: four times those of a wide window.
 const REPORT_COLUMNS: u32 = 4096;
 
 /// What is shown: the same as both kinds.
 enum Content {
     WhatIf(Arc<WhatIf>),
-    Recording(Arc<Recording>),
+    Recording(Arc<Played>),
 }
 
 impl Content {
@@ -40,13 +48,16 @@ impl Content {
 
 pub fn panel(args: &Args, terminal: &mut Terminal) -> End {
     let bell = Bell::default();
+    if let Some(started) = &args.of_rig {
+        return of_rig(args, started, bell, terminal);
+    }
     let shown = if is_log(&args.file) {
         if !args.experiments.is_empty() {
             terminal.error(&format!("{} is a recording: it has no experiments", args.file.display()));
             return End::Misused;
         }
-        match recording(args, terminal) {
-            Ok(recording) => Content::Recording(Arc::new(recording)),
+        match recording(args, &bell, terminal) {
+            Ok(recording) => Content::Recording(recording),
             Err(why) => {
                 terminal.error(&format!("{}: {why}", args.file.display()));
                 return End::Failed;
@@ -80,25 +91,115 @@ fn is_log(path: &Path) -> bool {
     path.is_file() && File::open(path).and_then(|mut file| file.read_exact(&mut begin)).is_ok() && begin == MAGIC
 }
 
-fn recording(args: &Args, terminal: &Terminal) -> Result<Recording, String> {
+/// A recording. One that is still being written is followed in a thread of its own, unless it is for a report.
+fn recording(args: &Args, bell: &Bell, terminal: &Terminal) -> Result<Arc<Played>, String> {
     let Opened { mut reader, ready, control } = rig_log::open(&args.file, args.interpret, terminal)?;
     let name = args.file.display().to_string();
     let mut recording = Recording::new(&name, &ready.rig, ready.control.description(), &control, args.keep);
-    loop {
-        match reader.message() {
-            Ok(Some(message)) if !recording.add(&message) => {
-                return Err("it holds a cycle that is not of this rig".into());
-            }
-            Ok(Some(_)) => {}
-            Ok(None) => break,
-            Err(error) => return Err(error.to_string()),
-        }
-    }
-    if recording.is_empty() {
+    let grows = is_claimed(&args.file) && args.save.is_none();
+    read_on(&mut reader, &mut recording)?;
+    if recording.is_empty() && !grows {
         return Err("it holds no cycle".into());
     }
-    recording.end(rig_log::ending(&reader, "it").unwrap_or_else(|damaged| damaged));
-    Ok(recording)
+    if !grows || reader.tail().is_some() {
+        recording.end(rig_log::ending(&reader, "it").unwrap_or_else(|damaged| damaged));
+        return Ok(Arc::new(Played::new(recording)));
+    }
+    let (played, bell, file) = (Arc::new(Played::new(recording)), bell.clone(), args.file.clone());
+    let followed = played.clone();
+    std::thread::Builder::new()
+        .name("log".into())
+        .spawn(move || follow(reader, &followed, &file, &bell))
+        .map_err(|error| error.to_string())?;
+    Ok(played)
+}
+
+/// Follows a log until its writer has ended it.
+fn follow(mut reader: Reader, played: &Played, file: &Path, bell: &Bell) {
+    let mut grows = true;
+    while grows {
+        std::thread::sleep(LOOK);
+        // Asked first: what is written until the claim is given up is in the file then.
+        grows = is_claimed(file);
+        let mut recording = played.recording();
+        let read = reader.resume().map_err(|error| error.to_string());
+        let read = read.and_then(|()| read_on(&mut reader, &mut recording));
+        grows &= read.is_ok() && reader.tail().is_none() && !matches!(reader.end(), Some(LogEnd::Damaged { .. }));
+        match read {
+            Ok(0) if grows => continue,
+            Ok(_) if grows => recording.added(),
+            Ok(_) => recording.end(rig_log::ending(&reader, "it").unwrap_or_else(|damaged| damaged)),
+            Err(why) => recording.end(why),
+        }
+        drop(recording);
+        bell.ring();
+    }
+}
+
+/// Beside a rig that runs: see [`super::beside`]. Ends with the last page that shows it, once the rig has ended.
+fn of_rig(args: &Args, started: &str, bell: Bell, terminal: &mut Terminal) -> End {
+    let name = args.file.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+    let operated = Arc::new(Operated::new(&name, Box::new(std::io::stdout()), bell.clone()));
+    let open = match Panel::open(args.port, operated.clone(), bell.clone()) {
+        Ok(open) => open,
+        Err(why) => {
+            terminal.error(&format!("no panel: {why}"));
+            return End::Failed;
+        }
+    };
+    let link = open.link();
+    terminal.line(&format!("link {link}"));
+    let _door = (!args.no_open).then(|| show(&link)).flatten();
+    std::thread::spawn(move || open.serve());
+    {
+        let (operated, file, bell) = (operated.clone(), args.file.clone(), bell.clone());
+        let (started, interpret, keep) = (started.to_string(), args.interpret, args.keep);
+        std::thread::spawn(move || {
+            let is_ours = || Reader::open(&file).is_ok_and(|reader| reader.head.text("started") == Some(&started));
+            while !is_ours() {
+                if operated.is_over() {
+                    return;
+                }
+                std::thread::sleep(LOOK);
+            }
+            match rig_log::open(&file, interpret, &Terminal::new()) {
+                Ok(Opened { reader, ready, control }) => {
+                    let name = file.display().to_string();
+                    let recording = Recording::new(&name, &ready.rig, ready.control.description(), &control, keep);
+                    let played = Arc::new(Played::new(recording));
+                    operated.begins(played.clone(), &ready.live, &ready.control);
+                    follow(reader, &played, &file, &bell);
+                }
+                Err(why) => operated.told(&format!("problem its log cannot be shown: {why}")),
+            }
+        });
+    }
+    for line in std::io::stdin().lock().lines() {
+        let Ok(line) = line else { break };
+        operated.told(&line);
+    }
+    operated.left();
+    // A page that is loaded again has no connection for a moment.
+    let mut alone = Instant::now();
+    while alone.elapsed() < REMAINS {
+        std::thread::sleep(Duration::from_millis(100));
+        if bell.viewers() > 0 {
+            alone = Instant::now();
+        }
+    }
+    End::Fine
+}
+
+/// Adds all messages that can be read now; returns their number.
+fn read_on(reader: &mut Reader, recording: &mut Recording) -> Result<u64, String> {
+    let mut added = 0;
+    while let Some(message) = reader.message().map_err(|error| error.to_string())? {
+        if !recording.add(&message) {
+            return Err("it holds a cycle that is not of this rig".into());
+        }
+        added += 1;
+    }
+    Ok(added)
 }
 
 fn save(path: &Path, shown: &Content, terminal: &mut Terminal) -> End {
@@ -106,7 +207,7 @@ fn save(path: &Path, shown: &Content, terminal: &mut Terminal) -> End {
     let (hello, state) = (subject.hello().1, subject.state().1);
     let curves = match shown {
         Content::WhatIf(one) => one.curves(),
-        Content::Recording(one) => one.curves(REPORT_COLUMNS),
+        Content::Recording(one) => one.recording().curves(REPORT_COLUMNS),
     };
     let title = hello["title"].as_str().unwrap_or_default().to_string();
     match project::write(path, report(&title, &hello, &state, &curves).as_bytes()) {

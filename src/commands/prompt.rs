@@ -3,6 +3,7 @@
 //! In: lines. Out: commands, and the result of each. The reading thread sends `stop` itself, so a stop never waits for
 //! a set of parameters that is being validated.
 
+use super::beside::{Asked, Beside};
 use crate::compile::{self, Changes, Loaded, Options};
 use crate::loop_stability;
 use crate::source_snapshot::Kept;
@@ -95,17 +96,32 @@ impl Rehearsal {
     }
 }
 
-/// Reads the operator's input line by line. Without a rehearsal, no parameter may change.
-pub fn prompt(operator: Operator, rehearsal: Option<Rehearsal>) {
+/// A command: typed here, or by a viewer of the panel.
+enum Line {
+    Typed(String),
+    Asked(Asked),
+}
+
+/// Reads the operator's input line by line, and the commands from the panel beside it. Without a rehearsal, no parameter
+/// may change.
+pub fn prompt(operator: Operator, rehearsal: Option<Rehearsal>, beside: Option<Beside>) {
     let stopper = operator.stopper();
-    let (lines, typed) = channel::<String>();
+    let (lines, typed) = channel::<Line>();
+    if let Some(beside) = beside {
+        let (lines, stopper) = (lines.clone(), stopper.clone());
+        std::thread::spawn(move || {
+            beside.read(&stopper, &|asked| {
+                let _ = lines.send(Line::Asked(asked));
+            });
+        });
+    }
     let carrying = std::thread::spawn(move || carry_out(operator, rehearsal, &typed));
     for line in std::io::stdin().lock().lines() {
         let Ok(line) = line else { break };
         match line.trim() {
             "" => {}
             "stop" | "quit" => stopper.stop(),
-            line if lines.send(line.into()).is_err() => break,
+            line if lines.send(Line::Typed(line.into())).is_err() => break,
             _ => {}
         }
     }
@@ -114,28 +130,33 @@ pub fn prompt(operator: Operator, rehearsal: Option<Rehearsal>) {
 }
 
 /// Executes lines in order, and reports the result of each.
-fn carry_out(mut operator: Operator, mut rehearsal: Option<Rehearsal>, typed: &Receiver<String>) {
+fn carry_out(mut operator: Operator, mut rehearsal: Option<Rehearsal>, typed: &Receiver<Line>) {
     let mut terminal = Terminal::new();
     for line in typed {
+        let text = match &line {
+            Line::Typed(text) => text,
+            Line::Asked(asked) => &asked.text,
+        };
         let mut wait = |command| match operator.wait(command) {
             Answer::Taken => Ok(()),
             Answer::Refused(why) => Err(why.words()),
         };
-        let done = match (line.as_str(), line.strip_prefix("set "), &mut rehearsal) {
+        let done = match (text.as_str(), text.strip_prefix("set "), &mut rehearsal) {
             ("enable", ..) => wait(Command::Enable),
             ("arm", ..) => wait(Command::Arm),
             ("reset", ..) => Err(NO_RESET.into()),
-            (_, Some(set), Some(rehearsal)) => rehearsal.change(&mut operator, set).map(|()| {
-                terminal.line(&format!("  {line}"));
-            }),
+            (_, Some(set), Some(rehearsal)) => rehearsal.change(&mut operator, set),
             (_, Some(_), None) => Err(Reason::Unjudged.words()),
-            (_, None, _) => {
-                terminal.error("type enable, arm, set PATH = VALUE or stop");
-                continue;
-            }
+            (_, None, _) => Err("type enable, arm, set PATH = VALUE or stop".into()),
         };
-        if let Err(why) = done {
-            terminal.error(&format!("`{line}` is refused: {why}"));
+        match (&done, &line) {
+            (Ok(()), Line::Typed(text)) if text.starts_with("set ") => terminal.line(&format!("  {text}")),
+            (Ok(()), Line::Typed(_)) => {}
+            (Ok(()), Line::Asked(asked)) => terminal.line(&format!("  panel: {}", asked.text)),
+            (Err(why), _) => terminal.error(&format!("`{text}` is refused: {why}")),
+        }
+        if let Line::Asked(asked) = line {
+            asked.answer(&done);
         }
     }
 }

@@ -1,4 +1,4 @@
-//! What a panel shows: experiments that run anew at every touch, and recordings of rigs.
+//! What a panel shows: experiments that run anew at every touch, recordings of rigs, and rigs that run.
 //!
 //! In: compiled experiments, or a log. Out: a [`Subject`](panel::subject::Subject) each, whose curves, parameters and
 //! verdicts the crate `panel` brings to browsers.
@@ -7,3 +7,4 @@ mod knob;
 mod sheet;
 pub mod what_if;
 pub mod recording;
+pub mod operated;

@@ -1,7 +1,7 @@
 //! A recording of a rig: its cycles as curves, and what happened beside them.
 //!
-//! In: the messages of a log, one after the other. Out: curves thinned from their extremes at every scale, in bounded
-//! memory; events; a histogram of how late the cycles began.
+//! In: the messages of a log, one after the other; more may come while it is shown. Out: curves thinned from their
+//! extremes at every scale, in bounded memory; events; a histogram of how late the cycles began.
 
 use super::sheet::{Sheet, Signal};
 use abi::format;
@@ -10,7 +10,7 @@ use abi::unit::{Dimension, Unit};
 use abi::{Description, Slot};
 use panel::frame::{Block, COLUMNS, Frame, PATH};
 use panel::history::History;
-use panel::line::View;
+use panel::line::{View, Window};
 use panel::subject::Subject;
 use panel::thin;
 use panel::words::clean;
@@ -20,7 +20,9 @@ use runtime::hil::words;
 use runtime::record::log::{LOST, Message};
 use runtime::safety::Clamps;
 use serde_json::{Value, json};
-use std::collections::{BTreeSet, VecDeque};
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
 
 /// Events that are kept, the newest.
 const EVENTS: usize = 2000;
@@ -30,7 +32,10 @@ const BARS: usize = 5 * PARTS;
 /// Points of a path.
 const PATH_POINTS: u64 = 60_000;
 
-/// SignalKind happened at a time.
+/// Interval at which counts and the histogram are shown anew while more comes.
+const TELL: Duration = Duration::from_millis(500);
+
+/// Something that happened at a time.
 struct Event {
     cycle: u64,
     kind: &'static str,
@@ -57,9 +62,14 @@ pub struct Recording {
     cycles: u64,
     missed: u64,
     lost: u64,
-    ends: String,
+    /// How it ended; none while more comes.
+    ends: Option<String>,
     /// Its first cycle.
     first: Option<u64>,
+    /// Number of what [`Subject::state`] tells, and when it changed last.
+    told: (u64, Instant),
+    /// Parameters that were set while it ran, SI.
+    set: BTreeMap<Slot, f64>,
 }
 
 /// The SI unit of a signal of a node.
@@ -119,8 +129,10 @@ impl Recording {
             cycles: 0,
             missed: 0,
             lost: 0,
-            ends: String::new(),
+            ends: None,
             first: None,
+            told: (1, Instant::now()),
+            set: BTreeMap::new(),
         }
     }
 
@@ -151,7 +163,29 @@ impl Recording {
         for output in 0..self.clamped.len() {
             self.clamp(output, end, Clamps::default());
         }
-        self.ends = ends;
+        self.ends = Some(ends);
+        self.tell();
+    }
+
+    fn tell(&mut self) {
+        self.told = (self.told.0 + 1, Instant::now());
+    }
+
+    /// Says that some messages were added.
+    pub fn added(&mut self) {
+        if self.told.1.elapsed() > TELL {
+            self.tell();
+        }
+    }
+
+    /// The value of a parameter that was set while it ran, SI.
+    pub fn set_value(&self, slot: Slot) -> Option<f64> {
+        self.set.get(&slot).copied()
+    }
+
+    /// The number of [`Recording::state`].
+    pub fn told(&self) -> u64 {
+        self.told.0
     }
 
     /// Whether it holds a cycle.
@@ -164,6 +198,7 @@ impl Recording {
             self.events.pop_front();
         }
         self.events.push_back(Event { cycle, kind, text });
+        self.tell();
     }
 
     fn clamp(&mut self, output: usize, at: u64, clamps: Clamps) {
@@ -206,7 +241,8 @@ impl Recording {
             self.event(at, "good", whose.into());
         }
         for (slot, si) in &cycle.set {
-            let text = self.set(*slot, *si);
+            self.set.insert(*slot, *si);
+            let text = self.words_of_set(*slot, *si);
             self.event(at, "set", text);
         }
         for cause in &cycle.causes {
@@ -221,7 +257,7 @@ impl Recording {
         }
     }
 
-    fn set(&self, slot: Slot, si: f64) -> String {
+    fn words_of_set(&self, slot: Slot, si: f64) -> String {
         let quantity = self.description.quantities.iter().find(|quantity| quantity.slot == slot);
         match quantity {
             Some(quantity) => format!("{} = {}", quantity.path, format::quantity(si, &quantity.unit, 6)),
@@ -246,7 +282,7 @@ impl Recording {
 
     /// Curves of the whole recording in this many columns, for a report.
     pub fn curves(&self, columns: u32) -> Vec<(u32, Vec<(f64, f64)>)> {
-        let (first, count, width) = self.columns(None, columns);
+        let (first, count, width) = self.columns(Window::All, columns, self.history.cycles().end);
         let curve = |signal: usize| {
             let pairs = self.history.columns(signal, first, count, width);
             let points = pairs.iter().enumerate().flat_map(|(i, (a, b))| {
@@ -261,19 +297,47 @@ impl Recording {
         (0..self.sheet.signals.len()).map(|signal| (signal as u32, curve(signal))).collect()
     }
 
-    /// The first column of a window, their number, and cycles a column.
-    fn columns(&self, window: Option<(f64, f64)>, columns: u32) -> (u64, usize, u64) {
-        let all = self.history.cycles();
+    /// The begin of what is in memory, and the end up to `end` cycles, s.
+    fn extent(&self, end: u64) -> (f64, f64) {
+        (self.seconds(self.first.unwrap_or(0).max(self.history.cycles().start)), self.seconds(end))
+    }
+
+    fn cycle_at(&self, seconds: f64) -> u64 {
+        (seconds / self.seconds(1)).clamp(0.0, 1e15) as u64
+    }
+
+    /// The first column of a window, their number, and cycles a column, when the data went to cycle `end`.
+    fn columns(&self, window: Window, columns: u32, end: u64) -> (u64, usize, u64) {
+        let (begin, newest) = self.extent(end);
         let (from, to) = match window {
-            Some((from, to)) => {
-                let cycle = |seconds: f64| (seconds / self.seconds(1)).clamp(0.0, 1e15) as u64;
-                (cycle(from).saturating_sub(1), cycle(to) + 2)
+            Window::All => (self.cycle_at(begin), end),
+            // Its width depends on nothing but the view, so that columns stay the same while more comes.
+            Window::Last(seconds) => {
+                let width = self.cycle_at(seconds).div_ceil(u64::from(columns)).max(1);
+                let first = end.saturating_sub(u64::from(columns) * width) / width;
+                return (first, (end.div_ceil(width) - first) as usize, width);
             }
-            None => (self.first.unwrap_or(0).max(all.start), all.end),
+            Window::Span(..) => {
+                let (from, to) = window.within(begin, newest);
+                (self.cycle_at(from).saturating_sub(1), self.cycle_at(to) + 2)
+            }
         };
         let width = (to - from).div_ceil(u64::from(columns)).max(1);
         let first = from / width;
         (first, ((to.div_ceil(width) - first) as usize).min(columns as usize + 2), width)
+    }
+
+    /// The columns of a view that are new or others since the data went to cycle `since`.
+    fn fresh(&self, view: &View, columns: u32, since: Option<u64>) -> (u64, usize, u64) {
+        let (first, count, width) = self.columns(view.window, columns, self.history.cycles().end);
+        let Some(since) = since else { return (first, count, width) };
+        let (_, _, before) = self.columns(view.window, columns, since);
+        if before != width {
+            return (first, count, width);
+        }
+        // The last column was not complete then.
+        let begin = (since / width).max(first);
+        (begin, (first + count as u64).saturating_sub(begin) as usize, width)
     }
 }
 
@@ -283,16 +347,12 @@ fn edge(bar: usize) -> f64 {
     10f64.powf(bar as f64 / PARTS as f64)
 }
 
-impl Subject for Recording {
-    fn hello(&self) -> (u64, Value) {
+impl Recording {
+    /// What does not change: see [`Subject::hello`].
+    pub fn hello(&self) -> Value {
         let (signals, canvases) = self.sheet.json();
-        let events = self
-            .events
-            .iter()
-            .rev()
-            .map(|event| json!({ "t": self.seconds(event.cycle), "kind": event.kind, "text": clean(&event.text) }));
-        let all = self.history.cycles();
-        let value = json!({
+        let (from, to) = self.extent(self.history.cycles().end);
+        json!({
             "kind": "recording",
             "file": clean(&self.name),
             "title": clean(&self.rig.name),
@@ -301,10 +361,41 @@ impl Subject for Recording {
             "signals": signals,
             "canvases": canvases,
             "knobs": [],
-            "from": self.seconds(self.first.unwrap_or(0).max(all.start)),
-            "to": self.seconds(all.end),
+            "from": from,
+            "to": to,
             "period": self.seconds(1),
             "solver": "",
+            "grows": self.ends.is_none(),
+        })
+    }
+
+    /// What changes now and then: see [`Subject::state`].
+    pub fn state(&self) -> Value {
+        let events = self
+            .events
+            .iter()
+            .rev()
+            .map(|event| json!({ "t": self.seconds(event.cycle), "kind": event.kind, "text": clean(&event.text) }));
+        let (from, to) = self.extent(self.history.cycles().end);
+        let cut = self.first.is_some_and(|first| self.history.cycles().start > first);
+        let ends = self.ends.as_deref().unwrap_or("more comes");
+        let mut words = format!("{} cycles; {ends}", format::count(self.cycles));
+        if cut {
+            words += "; its beginning does not fit into --keep";
+        }
+        if self.lost > 0 {
+            words += &format!("; {} messages were lost when it was written", format::count(self.lost));
+        }
+        json!({
+            "values": [],
+            "texts": [],
+            "layers": [true],
+            "kept": [],
+            "words": clean(&words),
+            "set": "",
+            "from": from,
+            "to": to,
+            "grows": self.ends.is_none(),
             "events": events.collect::<Vec<_>>(),
             "late": {
                 "edges": (0..=BARS).map(edge).collect::<Vec<_>>(),
@@ -314,54 +405,30 @@ impl Subject for Recording {
                 "max": f64::from(self.late_ns_max) * 1e-3,
                 "missed": self.missed,
             },
-        });
-        (1, value)
-    }
-
-    fn state(&self) -> (u64, Value) {
-        let cut = self.first.is_some_and(|first| self.history.cycles().start > first);
-        let mut words = format!("{} cycles; {}", format::count(self.cycles), self.ends);
-        if cut {
-            words += "; its beginning does not fit into --keep";
-        }
-        if self.lost > 0 {
-            words += &format!("; {} messages were lost when it was written", format::count(self.lost));
-        }
-        (1, json!({ "values": [], "texts": [], "layers": [true], "kept": [], "words": clean(&words), "set": "" }))
-    }
-
-    fn version(&self) -> u64 {
-        1
-    }
-
-    fn newest(&self) -> f64 {
-        self.seconds(self.history.cycles().end)
+        })
     }
 
     fn blocks(&self, view: &View, since: Option<u64>, frame: &mut Frame) {
         let count = self.sheet.signals.len();
-        if since.is_some() || view.signals.iter().any(|signal| *signal as usize >= count) {
+        if view.signals.iter().any(|signal| *signal as usize >= count) {
             return;
         }
+        let all = self.history.cycles();
         if let Some(columns) = view.columns {
-            let (first, count, width) = self.columns(view.window, columns);
+            let (first, count, width) = self.fresh(view, columns, since);
+            if count == 0 {
+                return;
+            }
             for signal in &view.signals {
                 let pairs = self.history.columns(*signal as usize, first, count, width);
                 let cycles = u32::try_from(width).unwrap_or(u32::MAX);
-                frame.columns(
-                    Block { kind: COLUMNS, view: view.id, curve: *signal, cycles, first: first as f64 },
-                    &pairs,
-                );
+                let block = Block { kind: COLUMNS, view: view.id, curve: *signal, cycles, first: first as f64 };
+                frame.columns(block, &pairs);
             }
         } else if let [x, y] = view.signals[..] {
-            let all = self.history.cycles();
-            let (from, to) = match view.window {
-                Some((from, to)) => {
-                    let cycle = |seconds: f64| (seconds / self.seconds(1)).clamp(0.0, 1e15) as u64;
-                    (cycle(from).max(all.start), (cycle(to) + 1).min(all.end))
-                }
-                None => (all.start, all.end),
-            };
+            let (begin, end) = self.extent(all.end);
+            let (from, to) = view.window.within(begin, end);
+            let (from, to) = (self.cycle_at(from).max(all.start), (self.cycle_at(to) + 1).min(all.end));
             let to = to.min(from.saturating_add(PATH_POINTS));
             let value = |signal: u32, cycle| self.history.value(signal as usize, cycle);
             let points: Vec<(f64, f64)> = (from..to).map(|cycle| (value(x, cycle), value(y, cycle))).collect();
@@ -369,6 +436,45 @@ impl Subject for Recording {
             let first = points.first().map_or(0.0, |point| point.0);
             frame.path(Block { kind: PATH, view: view.id, curve: y, cycles: 0, first }, &points);
         }
+    }
+}
+
+/// A recording that is shown, and may grow meanwhile.
+pub struct Played(Mutex<Recording>);
+
+impl Played {
+    /// Of a recording.
+    pub fn new(recording: Recording) -> Played {
+        Played(Mutex::new(recording))
+    }
+
+    /// The recording.
+    pub fn recording(&self) -> MutexGuard<'_, Recording> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Subject for Played {
+    fn hello(&self) -> (u64, Value) {
+        (1, self.recording().hello())
+    }
+
+    fn state(&self) -> (u64, Value) {
+        let recording = self.recording();
+        (recording.told.0, recording.state())
+    }
+
+    fn version(&self) -> u64 {
+        self.recording().history.cycles().end
+    }
+
+    fn newest(&self) -> f64 {
+        let recording = self.recording();
+        recording.seconds(recording.history.cycles().end)
+    }
+
+    fn blocks(&self, view: &View, since: Option<u64>, frame: &mut Frame) {
+        self.recording().blocks(view, since, frame);
     }
 
     fn say(&self, _: &str) -> Result<String, String> {

@@ -563,7 +563,7 @@ impl Subject for WhatIf {
             let setup = &inner.setup;
             (layers.collect(), setup.sheet.signals.len(), setup.cases.len(), inner.end())
         };
-        let (from, to) = view.window.unwrap_or((0.0, duration));
+        let (from, to) = view.window.within(0.0, duration);
         if view.signals.iter().any(|signal| *signal as usize >= signals) {
             return;
         }

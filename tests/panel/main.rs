@@ -6,6 +6,7 @@ mod browser;
 #[path = "../support/debian.rs"]
 mod debian;
 mod hostile;
+mod operated;
 mod people;
 mod recording;
 mod strangers;

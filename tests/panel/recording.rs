@@ -1,10 +1,13 @@
 //! Recordings of rigs.
 
-use crate::browser::browser;
+use crate::browser::{Page, browser};
 use crate::{Panel, folder, fric};
 use serde_json::json;
 use std::fs;
-use std::path::PathBuf;
+use std::io::Write;
+use std::path::{Path, PathBuf};
+use std::process::{Child, ChildStdin, Stdio};
+use std::time::{Duration, Instant};
 
 /// A log of the rig of the example in simulated time.
 fn log(name: &str, seconds: u32) -> PathBuf {
@@ -92,4 +95,101 @@ fn a_log_cut_off_by_a_crash_is_a_recording_too() {
     let output = fric().args(["panel", "examples/rtfs/rtfs.fric", "--no-open"]).output().unwrap();
     assert_eq!(output.status.code(), Some(1));
     assert!(String::from_utf8_lossy(&output.stderr).contains("a rig cannot be varied yet"));
+}
+
+/// A rig with simulated drives in wall-clock time, until dropped.
+struct Running(Child, ChildStdin);
+
+impl Running {
+    fn start(log: &Path) -> Running {
+        let mut command = fric();
+        command.args(["hil", "examples/rtfs/rtfs.fric", "--sim", "--arm", "--count-overruns", "--quiet"]);
+        command.arg("--log").arg(log).stdin(Stdio::piped());
+        let mut child = command.stdout(Stdio::null()).stderr(Stdio::null()).spawn().expect("fric starts");
+        let prompt = child.stdin.take().expect("piped");
+        let running = Running(child, prompt);
+        // Its head is written with its first block, when the start-up has asked the drives.
+        let begun = Instant::now();
+        while fs::metadata(log).map_or(0, |log| log.len()) < 4096 {
+            assert!(begun.elapsed() < Duration::from_secs(60), "no log");
+            std::thread::sleep(Duration::from_millis(20));
+        }
+        running
+    }
+}
+
+impl Drop for Running {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+/// The end of the window, as screen readers are told, s.
+fn to(page: &Page) -> f64 {
+    let told = page.text("document.querySelector('.plot canvas[role=img]').getAttribute('aria-label') ?? ''");
+    let to = told.split(" s to ").nth(1).and_then(|rest| rest.split(" s,").next()?.parse().ok());
+    to.unwrap_or(f64::NAN)
+}
+
+#[test]
+fn a_rig_that_runs_is_followed_through_its_log() {
+    let path = folder("live").join("rtfs.friclog");
+    let mut rig = Running::start(&path);
+    let panel = Panel::open(&[path.to_str().unwrap()]);
+    let page = browser().page(&panel.link);
+    page.wait("document.getElementById('sentence')?.textContent.includes('more comes')");
+    page.wait("/ to .* at the end/.test(document.querySelector('.plot canvas[role=img]').getAttribute('aria-label'))");
+    let first = to(&page);
+    page.wait("document.getElementById('happened').textContent.includes('armed: the model runs')");
+    let later = |than: f64| {
+        let begun = Instant::now();
+        while to(&page).partial_cmp(&(than + 0.5)) != Some(std::cmp::Ordering::Greater) {
+            assert!(begun.elapsed() < Duration::from_secs(30), "the picture stands still at {}", to(&page));
+            std::thread::sleep(Duration::from_millis(50));
+        }
+    };
+    later(first);
+    page.shot("recording-grows");
+    // The space bar holds the picture, while more comes.
+    page.value("document.activeElement.blur()");
+    page.key(" ");
+    // What screen readers are told follows with up to half a second, or later on a busy machine.
+    let (begun, mut held) = (Instant::now(), to(&page));
+    loop {
+        std::thread::sleep(Duration::from_millis(1200));
+        let now = to(&page);
+        if now == held {
+            break;
+        }
+        held = now;
+        assert!(begun.elapsed() < Duration::from_secs(30), "the picture goes on at {held}");
+    }
+    page.key("Home");
+    later(held);
+    // The end is that of the whole recording, and so are its curves.
+    rig.1.write_all(b"stop\n").expect("the rig listens");
+    assert!(rig.0.wait().unwrap().success());
+    page.wait("document.getElementById('sentence').textContent.includes('it ended as asked')");
+    page.key("Home");
+    let csv = path.with_extension("csv");
+    let output = fric().args(["replay", path.to_str().unwrap(), "--csv"]).arg(&csv).output().unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let last = fs::read_to_string(&csv).unwrap();
+    let last: f64 = last.lines().last().and_then(|line| line.split(',').nth(1)?.parse().ok()).expect("a row");
+    page.wait(&format!(
+        "Math.abs(Number(document.querySelector('.plot canvas[role=img]').getAttribute('aria-label').split(' s to ')[1].split(' s,')[0]) - {last}) < 0.01"
+    ));
+    assert_eq!(page.complaints(), [""; 0]);
+
+    // One whose writer is killed is a recording that was not ended.
+    let path = folder("killed").join("rtfs.friclog");
+    let mut rig = Running::start(&path);
+    let panel = Panel::open(&[path.to_str().unwrap()]);
+    let page = browser().page(&panel.link);
+    page.wait("document.getElementById('sentence')?.textContent.includes('more comes')");
+    let _ = rig.0.kill();
+    let killed = Instant::now();
+    page.wait("/killed/.test(document.getElementById('sentence').textContent)");
+    assert!(killed.elapsed() < Duration::from_secs(20), "{:?}", killed.elapsed());
 }

@@ -10,7 +10,7 @@
 //! The checksum (CRC-32) covers the number of the block, length, kind and bytes, so that a flipped bit, a missing block
 //! and a block out of order are all detected.
 
-use std::io::{self, Read, Write};
+use std::io::{self, Read, Seek, SeekFrom, Write};
 
 /// The first bytes of such a file.
 pub const MAGIC: &[u8] = b"fric log 1\n";
@@ -156,6 +156,21 @@ impl<R: Read> BlockReader<R> {
     fn stop(&mut self, end: End) -> Option<Block> {
         self.end = Some(end);
         None
+    }
+}
+
+impl<R: Read + Seek> BlockReader<R> {
+    /// Lets [`BlockReader::block`] return blocks that were written since it returned none. After damage nothing is
+    /// readable.
+    ///
+    /// # Errors
+    /// Those of the file.
+    pub fn resume(&mut self) -> io::Result<()> {
+        if let Some(End::Whole | End::Cut { .. }) = self.end {
+            self.input.seek(SeekFrom::Start(self.at))?;
+            self.end = None;
+        }
+        Ok(())
     }
 }
 

@@ -36,6 +36,17 @@ pub fn is_locked(path: &Path) -> bool {
     file.is_ok_and(|file| matches!(file.try_lock_shared(), Err(TryLockError::WouldBlock)))
 }
 
+/// The lock file of a claim.
+fn lock_file(path: &Path) -> PathBuf {
+    let name = path.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
+    path.with_file_name(format!(".{name}.lock"))
+}
+
+/// Whether a process holds the claim on a file.
+pub fn is_claimed(path: &Path) -> bool {
+    is_locked(&lock_file(path))
+}
+
 /// Exclusive write access to a file and to files named after it.
 pub struct Claim {
     lock: PathBuf,
@@ -52,8 +63,7 @@ impl Claim {
         if fs::metadata(path).is_ok_and(|found| !found.is_file()) {
             return Ok(None);
         }
-        let name = path.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
-        let lock = path.with_file_name(format!(".{name}.lock"));
+        let lock = lock_file(path);
         match open_alone(&lock)? {
             Some(file) => Ok(Some(Claim { lock, _file: file })),
             None => {
@@ -82,8 +92,10 @@ mod tests {
         let first = Claim::on(&path).unwrap();
         let why = Claim::on(&path).err().unwrap();
         assert_eq!(why.kind(), io::ErrorKind::ResourceBusy);
+        assert!(is_claimed(&path) && !is_claimed(&folder.path().join("b.friclog")));
         assert!(Claim::on(&folder.path().join("b.friclog")).unwrap().is_some());
         drop(first);
+        assert!(!is_claimed(&path));
         assert!(Claim::on(&path).unwrap().is_some());
         assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0, "nothing is left behind");
         assert!(Claim::on(Path::new("/dev/null")).unwrap().is_none());

@@ -556,6 +556,8 @@ pub struct Reader {
     path: PathBuf,
     number: u32,
     mark: u32,
+    /// The next file was there when this one was last looked at.
+    complete: bool,
 }
 
 impl Reader {
@@ -568,7 +570,7 @@ impl Reader {
         let bytes = head.bytes();
         let (number, mark) = part_of(&head).unwrap_or((1, blocks::mark(&bytes)));
         let path = path.to_path_buf();
-        Ok(Reader { blocks, head, tail: None, bytes: Vec::new(), at: 0, path, number, mark })
+        Ok(Reader { blocks, head, tail: None, bytes: Vec::new(), at: 0, path, number, mark, complete: false })
     }
 
     fn begin(path: &Path) -> Result<(BlockReader<BufReader<File>>, Sections), String> {
@@ -590,14 +592,31 @@ impl Reader {
     }
 
     /// Continues with the next file of the log; false if there is none.
-    fn follow(&mut self) -> bool {
+    fn follow(&mut self) -> io::Result<bool> {
         let path = parts::following(&self.path, self.number);
-        let Ok((blocks, head)) = Reader::begin(&path) else { return false };
+        let Ok((blocks, head)) = Reader::begin(&path) else { return Ok(false) };
         if part_of(&head) != Some((self.number + 1, self.mark)) {
-            return false;
+            return Ok(false);
         }
-        (self.blocks, self.path, self.number) = (blocks, path, self.number + 1);
-        true
+        if self.complete {
+            (self.blocks, self.path, self.number, self.complete) = (blocks, path, self.number + 1, false);
+        } else {
+            // This file may have grown since its end was read, and is complete only now that the next one exists.
+            self.complete = true;
+            self.blocks.resume()?;
+        }
+        Ok(true)
+    }
+
+    /// Lets [`Reader::message`] return messages that were written since it returned none.
+    ///
+    /// # Errors
+    /// Those of the file.
+    pub fn resume(&mut self) -> io::Result<()> {
+        if self.tail.is_none() {
+            self.blocks.resume()?;
+        }
+        Ok(())
     }
 
     /// The next message; none at the end of the readable part.
@@ -608,7 +627,7 @@ impl Reader {
         while self.at == self.bytes.len() {
             match self.blocks.block()? {
                 None => {
-                    let goes_on = self.tail.is_none() && self.blocks.end() == Some(End::Whole) && self.follow();
+                    let goes_on = self.tail.is_none() && self.blocks.end() == Some(End::Whole) && self.follow()?;
                     if !goes_on {
                         return Ok(None);
                     }
@@ -710,6 +729,47 @@ mod tests {
         assert_eq!(found[1], Message { kind: 2, words: vec![0; 300] });
         assert_eq!(found[1009], Message { kind: CYCLE, words: vec![999, !999] });
         assert_eq!((reader.tail(), reader.end()), (Some(&tail), Some(End::Whole)));
+    }
+
+    /// A reader that follows a log while it is written, in several files, at random instants: it finds each message once,
+    /// in order.
+    #[test]
+    fn a_growing_log_is_read_as_it_is_written() {
+        for seed in 1..=20 {
+            let mut chance = Chance(seed);
+            let folder = tempfile::tempdir().unwrap();
+            let path = folder.path().join("log.friclog");
+            let limits = Limits { part: 600, ..Limits::default() };
+            let mut log = Log::begin(settings(Sink::File(path.clone(), limits)), &head()).unwrap();
+            let (mut reader, mut found, mut k) = (None, Vec::new(), 0_u64);
+            let mut look = |reader: &mut Option<Reader>| {
+                if reader.is_none() {
+                    *reader = Reader::open(&path).ok();
+                }
+                let Some(reader) = reader else { return };
+                reader.resume().unwrap();
+                found.extend(messages(reader).into_iter().filter(|message| message.kind == CYCLE).map(|m| m.words[0]));
+            };
+            while k < 1000 {
+                for _ in 0..=chance.below(40) {
+                    if k % 50 == 0 {
+                        log.push(STATE, &[k; 20]);
+                    }
+                    // Words that do not compress, so that files become long enough to end.
+                    log.push(CYCLE, &[k, chance.number(), chance.number()]);
+                    k += 1;
+                }
+                if chance.below(3) == 0 {
+                    std::thread::sleep(Duration::from_millis(6));
+                }
+                look(&mut reader);
+            }
+            log.end(&Sections::default().with("end", "as asked"), false).unwrap();
+            look(&mut reader);
+            let reader = reader.unwrap();
+            assert!(reader.tail().is_some() && reader.number > 3, "seed {seed}: {} files", reader.number);
+            assert_eq!(found, (0..k).collect::<Vec<u64>>(), "seed {seed}");
+        }
     }
 
     #[test]

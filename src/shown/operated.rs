@@ -1,0 +1,331 @@
+//! A rig that runs, with its operator's commands: what its process tells, and its log as a recording that grows.
+//!
+//! In: lines of the rig's process (see `commands/beside.rs`), and the recording once its log has begun. Out: a subject
+//! whose words become lines to that process. Waits for no answer: an answer becomes part of the state, so a viewer whose
+//! set is being checked can still stop the rig.
+
+use super::knob::Knob;
+use super::recording::{Played, Recording};
+use abi::live::{Live, Tunable};
+use abi::{Instance, Slot};
+use panel::frame::Frame;
+use panel::line::View;
+use panel::server::Bell;
+use panel::subject::Subject;
+use panel::words::clean;
+use serde_json::{Value, json};
+use std::collections::BTreeMap;
+use std::io::Write;
+use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
+
+/// Age of the picture from which a command is refused, s: a click that waited in a dead link must not arm a rig.
+const OLD: f64 = 1.0;
+/// Commands that wait for their answer; the oldest is forgotten.
+const OPEN: usize = 64;
+
+/// What the rig's process has told.
+struct Inner {
+    stage: String,
+    next: String,
+    over: Option<String>,
+    problem: Option<String>,
+    /// Commands without an answer, by number.
+    open: BTreeMap<u64, String>,
+    last: u64,
+    /// The last answer, and its number.
+    answer: Option<(u64, String, Result<(), String>)>,
+    changes: u64,
+}
+
+/// A parameter that may change, and its slot.
+struct Turned {
+    knob: Knob,
+    slot: Slot,
+}
+
+/// The rig once its log has begun.
+struct Begun {
+    played: Arc<Played>,
+    knobs: Vec<Turned>,
+}
+
+/// A rig with its commands.
+pub struct Operated {
+    name: String,
+    inner: Mutex<Inner>,
+    begun: OnceLock<Begun>,
+    to: Mutex<Box<dyn Write + Send>>,
+    bell: Bell,
+}
+
+impl Operated {
+    /// Before its start-up has asked the drives. `to`: lines to the rig's process.
+    pub fn new(name: &str, to: Box<dyn Write + Send>, bell: Bell) -> Operated {
+        let inner = Inner {
+            stage: "starting".into(),
+            next: "-".into(),
+            over: None,
+            problem: None,
+            open: BTreeMap::new(),
+            last: 0,
+            answer: None,
+            changes: 1,
+        };
+        Operated { name: name.into(), inner: Mutex::new(inner), begun: OnceLock::new(), to: Mutex::new(to), bell }
+    }
+
+    fn inner(&self) -> MutexGuard<'_, Inner> {
+        self.inner.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn recording(&self) -> Option<MutexGuard<'_, Recording>> {
+        self.begun.get().map(|begun| begun.played.recording())
+    }
+
+    /// Its log has begun. `control`: the program whose parameters change.
+    pub fn begins(&self, played: Arc<Played>, live: &Live, control: &Instance) {
+        let quantities = &control.description().quantities;
+        let knobs = live.params.iter().filter_map(|param| {
+            let Tunable::Live(slot, _) = param.place else { return None };
+            let quantity = quantities.iter().find(|quantity| quantity.path == param.path && quantity.slot == slot)?;
+            Some(Turned { knob: Knob::new(quantity, control.block()[slot.index()]), slot })
+        });
+        let begun = Begun { played, knobs: knobs.collect() };
+        let _ = self.begun.set(begun);
+        self.inner().changes += 1;
+        self.bell.ring();
+    }
+
+    /// A line of the rig's process.
+    pub fn told(&self, line: &str) {
+        let (word, rest) = line.split_once(' ').unwrap_or((line, ""));
+        let mut inner = self.inner();
+        match word {
+            "stage" => {
+                let (next, stage) = rest.split_once(' ').unwrap_or((rest, ""));
+                (inner.next, inner.stage) = (next.into(), stage.into());
+            }
+            "over" => {
+                (inner.over, inner.next) = (Some(rest.into()), "-".into());
+            }
+            "problem" => inner.problem = Some(rest.into()),
+            "ok" | "refused" => {
+                let (number, why) = rest.split_once(' ').unwrap_or((rest, ""));
+                let Ok(number) = number.parse() else { return };
+                let Some(said) = inner.open.remove(&number) else { return };
+                let result = if word == "ok" { Ok(()) } else { Err(why.to_string()) };
+                inner.answer = Some((number, said, result));
+            }
+            _ => return,
+        }
+        inner.changes += 1;
+        drop(inner);
+        self.bell.ring();
+    }
+
+    /// Whether the run is over.
+    pub fn is_over(&self) -> bool {
+        self.inner().over.is_some()
+    }
+
+    /// The rig's process is there no longer.
+    pub fn left(&self) {
+        if !self.is_over() {
+            self.told("over the process of the rig was killed");
+        }
+    }
+
+    /// Says a line to the rig's process.
+    fn say_line(&self, line: &str) -> Result<(), String> {
+        let mut to = self.to.lock().unwrap_or_else(PoisonError::into_inner);
+        let said = to.write_all(format!("{line}\n").as_bytes()).and_then(|()| to.flush());
+        said.map_err(|_| "the rig has ended".to_string())
+    }
+}
+
+impl Subject for Operated {
+    fn hello(&self) -> (u64, Value) {
+        let (number, mut value) = match self.recording() {
+            Some(recording) => (2, recording.hello()),
+            None => (
+                1,
+                json!({
+                    "title": clean(&self.name), "experiments": [], "cases": [""], "signals": [], "canvases": [],
+                    "from": 0, "to": 0, "period": 0.001, "solver": "", "grows": true,
+                }),
+            ),
+        };
+        value["kind"] = json!("rig");
+        let knobs = self.begun.get().map_or(&[][..], |begun| &begun.knobs);
+        value["knobs"] = knobs.iter().map(|one| one.knob.json()).collect();
+        (number, value)
+    }
+
+    fn state(&self) -> (u64, Value) {
+        let (told, mut value) = match self.recording() {
+            Some(recording) => {
+                let knobs = &self.begun.get().expect("it has a recording").knobs;
+                let si = |one: &Turned| recording.set_value(one.slot).unwrap_or(one.knob.own);
+                let mut value = recording.state();
+                value["values"] = knobs.iter().map(|one| one.knob.unit.from_si(si(one))).collect();
+                value["texts"] = knobs.iter().map(|one| one.knob.text(si(one))).collect();
+                (recording.told(), value)
+            }
+            None => (0, json!({ "values": [], "texts": [], "layers": [true], "kept": [], "set": "", "events": [] })),
+        };
+        let inner = self.inner();
+        value["stage"] = clean(&inner.stage).into();
+        value["problem"] = inner.problem.as_deref().map(clean).into();
+        value["next"] = inner.next.clone().into();
+        value["over"] = inner.over.as_deref().map(clean).into();
+        value["answer"] = match &inner.answer {
+            Some((number, said, result)) => json!({
+                "number": number,
+                "said": clean(said),
+                "refused": result.as_ref().err().map(|why| clean(why)),
+            }),
+            None => Value::Null,
+        };
+        (told + inner.changes, value)
+    }
+
+    fn version(&self) -> u64 {
+        self.begun.get().map_or(0, |begun| begun.played.version())
+    }
+
+    fn newest(&self) -> f64 {
+        self.begun.get().map_or(0.0, |begun| begun.played.newest())
+    }
+
+    fn blocks(&self, view: &View, since: Option<u64>, frame: &mut Frame) {
+        if let Some(begun) = self.begun.get() {
+            begun.played.blocks(view, since, frame);
+        }
+    }
+
+    fn say(&self, words: &str) -> Result<String, String> {
+        let (seen, words) = match words.strip_prefix('@').and_then(|rest| rest.split_once(' ')) {
+            Some((seen, rest)) => (seen.parse::<f64>().ok(), rest.trim()),
+            None => (None, words.trim()),
+        };
+        if words.chars().any(char::is_control) {
+            return Err("a command is one line".into());
+        }
+        // A stop is obeyed with any age, and before anything else is asked.
+        let stops = words == "stop";
+        if !stops {
+            if words != "enable" && words != "arm" && !words.starts_with("set ") {
+                return Err("say enable, arm, set PATH = VALUE or stop".into());
+            }
+            if let Some(over) = &self.inner().over {
+                return Err(format!("the rig has ended: {over}"));
+            }
+            let age =
+                self.newest() - seen.ok_or("say first which picture you have seen: @SECONDS, the end of its data")?;
+            // What is not a number is not young either.
+            if !(-OLD..=OLD).contains(&age) {
+                return Err(format!("it was given before a picture that is {age:.1} s old: look, and give it again"));
+            }
+        }
+        let number = {
+            let mut inner = self.inner();
+            inner.last += 1;
+            let number = inner.last;
+            inner.open.insert(number, words.into());
+            if inner.open.len() > OPEN {
+                inner.open.pop_first();
+            }
+            number
+        };
+        self.say_line(&format!("{number} {words}"))?;
+        Ok(number.to_string())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[derive(Clone, Default)]
+    struct Lines(Arc<Mutex<Vec<u8>>>);
+
+    impl Write for Lines {
+        fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
+            self.0.lock().unwrap().extend(bytes);
+            Ok(bytes.len())
+        }
+        fn flush(&mut self) -> std::io::Result<()> {
+            Ok(())
+        }
+    }
+
+    fn open() -> (Operated, Lines) {
+        let lines = Lines::default();
+        (Operated::new("r", Box::new(lines.clone()), Bell::default()), lines)
+    }
+
+    /// Random words with random pictures: whatever is passed on is one line, known, and young, or `stop`.
+    #[test]
+    fn only_known_and_young_commands_are_passed_on_and_stop_always_is() {
+        const SEEN: &[&str] =
+            &["", "@0 ", "@0.9 ", "@-0.9 ", "@1.1 ", "@-1.1 ", "@nan ", "@inf ", "@x ", "@ ", "@0", "@-1e308 "];
+        const WORDS: &[&str] = &[
+            "stop",
+            "enable",
+            "arm",
+            "set fr.Fs = 1 N",
+            "set ",
+            "set",
+            "reset",
+            "stop\nenable",
+            "set a = 1\n7 arm",
+            "STOP",
+            "",
+            "enable stop",
+            "\u{7}stop",
+        ];
+        let mut passed = 0;
+        for seed in 0..(SEEN.len() * WORDS.len()) {
+            let (seen, words) = (SEEN[seed % SEEN.len()], WORDS[seed / SEEN.len()]);
+            let (operated, lines) = open();
+            let said = format!("{seen}{words}");
+            let result = operated.say(&said);
+            let written = String::from_utf8(lines.0.lock().unwrap().clone()).unwrap();
+            let known = matches!(words, "enable" | "arm" | "set fr.Fs = 1 N");
+            let young = matches!(seen, "@0 " | "@0.9 " | "@-0.9 ");
+            let stops = words == "stop" && seen.is_empty() | seen.ends_with(' ') && seen != "@ ";
+            match stops || known && young {
+                true => {
+                    passed += 1;
+                    assert_eq!((result.as_deref(), written), (Ok("1"), format!("1 {words}\n")), "{said:?}");
+                }
+                false if result.is_ok() => assert!(words == "stop" && written == "1 stop\n", "{said:?}: {written}"),
+                false => assert_eq!(written, "", "{said:?}"),
+            }
+        }
+        assert!(passed > 15, "{passed}");
+    }
+
+    #[test]
+    fn answers_and_the_end_are_part_of_the_state() {
+        let (operated, _) = open();
+        operated.told("stage enable waiting to be enabled");
+        assert_eq!(operated.state().1["next"], "enable");
+        operated.say("@0 enable").unwrap();
+        let before = operated.state().0;
+        operated.told("refused 1 it has no effect now");
+        let (after, state) = operated.state();
+        assert!(after > before);
+        assert_eq!(state["answer"], json!({ "number": 1, "said": "enable", "refused": "it has no effect now" }));
+        // Answers to nothing, and lines that are none, change nothing.
+        for line in ["ok 1", "ok", "refused x y", "", "hello", "\u{202e}"] {
+            operated.told(line);
+            assert_eq!(operated.state().0, after, "{line}");
+        }
+        operated.told("over stopped: enabling switch released");
+        assert!(operated.say("@0 arm").is_err_and(|why| why.contains("enabling switch released")));
+        assert!(operated.say("stop").is_ok());
+        operated.left();
+        assert_eq!(operated.state().1["over"], "stopped: enabling switch released");
+    }
+}
