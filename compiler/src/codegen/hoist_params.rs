@@ -6,9 +6,8 @@
 //!
 //! Source: Aho, Lam, Sethi, Ullman, *Compilers*, 2007, sec. 9.5.
 
-use crate::ir::build::{Build, prune};
+use crate::ir::build::prune;
 use crate::ir::cfg::{BlockId, Cfg, Part};
-use crate::ir::hash::HashMap;
 use crate::ir::variance::{Variance, variance};
 use crate::ir::verify::types;
 use crate::ir::{Func, Op, Type, Value};
@@ -39,25 +38,36 @@ fn divide(func: &Func, layout: &Layout) -> (Func, Func) {
     // Values that only other hoisted values need are not stored.
     let live = remaining.live();
     let hoisted: Vec<usize> = all.into_iter().filter(|at| live[*at]).collect();
-    let slots: HashMap<usize, Slot> =
-        hoisted.iter().enumerate().map(|(k, at)| (*at, Slot(first.0 + k as u32))).collect();
-    let (mut prepare, mut stores, mut step) = (Build::of(func), Vec::new(), Build::new(&func.name));
-    for at in hoisted {
+    let name = format!("{}, prepared", func.name);
+    let mut prepare = Func { name, ops: func.ops.clone(), ..Func::default() };
+    let push = |ops: &mut Vec<Op>, op: Op| {
+        ops.push(op);
+        Value(ops.len() as u32 - 1)
+    };
+    let mut ops: Vec<Op> = Vec::with_capacity(func.ops.len() + hoisted.len());
+    let mut moved: Vec<Value> = Vec::with_capacity(func.ops.len());
+    let mut hoisted = hoisted.into_iter().peekable();
+    for (at, op) in func.ops.iter().enumerate() {
+        if hoisted.next_if_eq(&at).is_none() {
+            let op = op.map(|operand| moved[operand.index()]);
+            moved.push(push(&mut ops, op));
+            continue;
+        }
+        let (slot, is_int) = (Slot(first.0 + prepare.stores.len() as u32), types[at] == Type::Int);
         let value = Value(at as u32);
         // An integer is stored as the real with the same bits.
-        let number = if types[at] == Type::Int { prepare.from_bits(value) } else { value };
-        stores.push((slots[&at], number));
+        let number = if is_int { push(&mut prepare.ops, Op::FromBits(value)) } else { value };
+        prepare.stores.push((slot, number));
+        let number = push(&mut ops, Op::Load(slot));
+        moved.push(if is_int { push(&mut ops, Op::ToBits(number)) } else { number });
     }
-    let mut moved: Vec<Value> = Vec::with_capacity(func.ops.len());
-    for (at, op) in func.ops.iter().enumerate() {
-        let found = slots.get(&at).map(|slot| step.load(*slot));
-        moved.push(match found {
-            Some(number) if types[at] == Type::Int => step.to_bits(number),
-            Some(number) => number,
-            None => step.op(op.map(|operand| moved[operand.index()])),
-        });
-    }
-    let name = format!("{}, prepared", func.name);
-    let prepare = Func { name, ops: prepare.into_ops(), stores, writes: Vec::new(), status: None };
-    (prune(&prepare), step.finish_as(func, &moved))
+    let to = |value: Value| moved[value.index()];
+    let step = Func {
+        name: func.name.clone(),
+        ops,
+        stores: func.stores.iter().map(|(slot, value)| (*slot, to(*value))).collect(),
+        writes: func.writes.iter().map(|write| write.map(to)).collect(),
+        status: func.status.map(to),
+    };
+    (prune(&prepare), prune(&step))
 }

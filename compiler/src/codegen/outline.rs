@@ -78,8 +78,8 @@ struct Writer<'a> {
 
 impl<'a> Writer<'a> {
     fn new(func: &'a Func, outlined: &'a Outlined) -> Writer<'a> {
-        let mut cfg = Cfg::straight(func, Entry::Several);
-        cfg.blocks.clear();
+        let mut cfg = Cfg::new(&func.name, Entry::Several);
+        cfg.ops.clone_from(&func.ops);
         cfg.scratch_len = outlined.scratch_len;
         Writer { func, outlined, cfg, known: HashSet::default(), insts: Vec::new() }
     }

@@ -10,7 +10,8 @@
 
 use crate::codegen::form_loop::MAX_IN_REGISTERS;
 use crate::ir::cfg::{BlockId, Cfg, Inst, Terminator};
-use crate::ir::hash::{HashMap, HashSet};
+use crate::ir::hash::HashMap;
+use crate::ir::value_map::ValueSet;
 use crate::ir::{Func, Op, Type, Value};
 use std::collections::BTreeSet;
 
@@ -31,7 +32,10 @@ pub fn predictive_commoning(cfg: &mut Cfg) {
     let handed: HashMap<Value, Value> =
         cfg.blocks[head.index()].params.iter().copied().zip(again.args.clone()).collect();
     let next = next_values(cfg, head, &handed);
-    let candidates: HashSet<Value> = next.keys().copied().collect();
+    if next.is_empty() {
+        return;
+    }
+    let candidates = ValueSet::of(cfg.ops.len(), next.keys().copied());
 
     let mut roots: Vec<Value> = Vec::new();
     for block in order.iter().filter(|block| **block != preheader) {
@@ -40,38 +44,34 @@ pub fn predictive_commoning(cfg: &mut Cfg) {
         let effects = block.insts.iter().filter(|inst| !matches!(inst, Inst::Compute(_) | Inst::Reload(..)));
         effects.for_each(|inst| inst.each_value(&mut |value| roots.push(value)));
     }
-    let computed: HashSet<Value> = computed(cfg, head);
-    let plain = needed(cfg, roots.clone(), &HashSet::default());
+    let (computed, none) = (computed(cfg, head), ValueSet::new(cfg.ops.len()));
+    let plain = needed(cfg, roots.clone(), &none);
     // What is carried needs its next value, which may in turn read a candidate.
     let mut carried: BTreeSet<Value> = BTreeSet::new();
     let live = loop {
         let next = carried.iter().map(|value| next[value]);
         let live = needed(cfg, roots.iter().copied().chain(next).collect(), &candidates);
-        let found: BTreeSet<Value> = candidates.iter().copied().filter(|value| live.contains(value)).collect();
+        let found: BTreeSet<Value> = candidates.keys().iter().copied().filter(|value| live.contains(*value)).collect();
         if found.len() == carried.len() {
             break live;
         }
         carried = found;
     };
-    let effort = |values: &HashSet<Value>| -> u32 {
-        values
-            .intersection(&computed)
-            .filter(|value| !carried.contains(value))
-            .map(|value| cfg.op(*value).effort())
-            .sum()
+    let effort = |values: &ValueSet, carried: &BTreeSet<Value>| -> u32 {
+        let values = values.keys().iter().filter(|value| computed.contains(**value) && !carried.contains(value));
+        values.map(|value| cfg.op(*value).effort()).sum()
     };
-    let before_it: u32 = plain.intersection(&computed).map(|value| cfg.op(*value).effort()).sum();
-    let saved = before_it.saturating_sub(effort(&live));
+    let saved = effort(&plain, &BTreeSet::new()).saturating_sub(effort(&live, &carried));
     let fits = handed.len() + carried.len() <= MAX_IN_REGISTERS;
     if carried.is_empty() || !fits || saved < least_effort(carried.len()) {
         return;
     }
 
     // The preheader computes the first ones.
-    let first = needed(cfg, carried.iter().copied().collect(), &HashSet::default());
-    let there: HashSet<Value> = self::computed(cfg, preheader);
-    let mut new: Vec<Value> =
-        first.into_iter().filter(|value| !cfg.is_free(*value) && !there.contains(value)).collect();
+    let first = needed(cfg, carried.iter().copied().collect(), &none);
+    let there = self::computed(cfg, preheader);
+    let new = first.keys().iter().copied().filter(|value| !cfg.is_free(*value) && !there.contains(*value));
+    let mut new: Vec<Value> = new.collect();
     new.sort_unstable();
     let block = &mut cfg.blocks[preheader.index()];
     block.insts.extend(new.into_iter().map(Inst::Compute));
@@ -80,7 +80,7 @@ pub fn predictive_commoning(cfg: &mut Cfg) {
     let block = &mut cfg.blocks[head.index()];
     block.params.extend(&carried);
     block.insts.retain(|inst| match inst {
-        Inst::Compute(value) => live.contains(value) && !carried.contains(value),
+        Inst::Compute(value) => live.contains(*value) && !carried.contains(value),
         _ => true,
     });
     let Terminator::Repeat { again, .. } = &mut cfg.blocks[latch.index()].end else { unreachable!("it repeats") };
@@ -88,17 +88,17 @@ pub fn predictive_commoning(cfg: &mut Cfg) {
 }
 
 /// The values that a block computes.
-fn computed(cfg: &Cfg, block: BlockId) -> HashSet<Value> {
+fn computed(cfg: &Cfg, block: BlockId) -> ValueSet {
     let of = |inst: &Inst| if let Inst::Compute(value) = inst { Some(*value) } else { None };
-    cfg.blocks[block.index()].insts.iter().filter_map(of).collect()
+    ValueSet::of(cfg.ops.len(), cfg.blocks[block.index()].insts.iter().filter_map(of))
 }
 
 /// All values that some values need, themselves included; what `given` values need is left out.
-fn needed(cfg: &Cfg, values: Vec<Value>, given: &HashSet<Value>) -> HashSet<Value> {
-    let mut all: HashSet<Value> = HashSet::default();
+fn needed(cfg: &Cfg, values: Vec<Value>, given: &ValueSet) -> ValueSet {
+    let mut all = ValueSet::new(cfg.ops.len());
     let mut open = values;
     while let Some(value) = open.pop() {
-        if all.insert(value) && !given.contains(&value) {
+        if all.insert(value, ()) && !given.contains(value) {
             cfg.op(value).each_operand(|operand| open.push(operand));
         }
     }
@@ -117,9 +117,10 @@ fn next_values(cfg: &Cfg, head: BlockId, handed: &HashMap<Value, Value>) -> Hash
     };
     let written = block.insts.iter().filter_map(|inst| if let Inst::Write(write) = inst { Some(write) } else { None });
     let written = written.flat_map(|write| [write.index, write.value]);
-    let always = needed(cfg, handed.values().copied().chain(tested).chain(written).collect(), &HashSet::default());
+    let always = handed.values().copied().chain(tested).chain(written).collect();
+    let always = needed(cfg, always, &ValueSet::new(cfg.ops.len()));
     let mut known: HashMap<Op, Value> = HashMap::default();
-    for value in (0..cfg.ops.len() as u32).map(Value).filter(|value| computed.contains(value)) {
+    for value in (0..cfg.ops.len() as u32).map(Value).filter(|value| computed.contains(*value)) {
         known.entry(cfg.op(value).ordered()).or_insert(value);
     }
     let types = cfg.types();
@@ -127,7 +128,7 @@ fn next_values(cfg: &Cfg, head: BlockId, handed: &HashMap<Value, Value>) -> Hash
     let mut next: Vec<Option<Value>> = vec![None; cfg.ops.len()];
     let reloaded =
         block.insts.iter().filter_map(|inst| if let Inst::Reload(value, _) = inst { Some(*value) } else { None });
-    let reloaded: HashSet<Value> = reloaded.collect();
+    let reloaded = ValueSet::of(cfg.ops.len(), reloaded);
     let mut found = HashMap::default();
     for (at, op) in cfg.ops.iter().enumerate() {
         let value = Value(at as u32);
@@ -135,7 +136,7 @@ fn next_values(cfg: &Cfg, head: BlockId, handed: &HashMap<Value, Value>) -> Hash
             (is_variant[at], next[at]) = (true, Some(*becomes));
             continue;
         }
-        is_variant[at] = matches!(op, Op::Ring { .. }) || reloaded.contains(&value);
+        is_variant[at] = matches!(op, Op::Ring { .. }) || reloaded.contains(value);
         let mut whole = !is_variant[at];
         op.each_operand(|operand| is_variant[at] |= is_variant[operand.index()]);
         let moved = op.map(|operand| match (is_variant[operand.index()], next[operand.index()]) {
@@ -147,13 +148,13 @@ fn next_values(cfg: &Cfg, head: BlockId, handed: &HashMap<Value, Value>) -> Hash
             (false, _) => operand,
         });
         if is_variant[at] && whole {
-            next[at] = known.get(&moved.ordered()).copied().filter(|next| always.contains(next));
+            next[at] = known.get(&moved.ordered()).copied().filter(|next| always.contains(*next));
             let is_cheap = op.effort() == 0 || matches!(op, Op::Neg(_) | Op::Abs(_) | Op::ToBits(_));
             // A comparison costs less than a register.
             if let Some(next) = next[at]
                 && !is_cheap
                 && types[at] != Type::Bool
-                && computed.contains(&value)
+                && computed.contains(value)
             {
                 found.insert(value, next);
             }

@@ -8,10 +8,10 @@
 //!
 //! Compare Rocha et al., *Loop Rolling for Code Size Reduction*, CGO 2022, and LLVM's `LoopReroll`.
 
-use crate::ir::hash::HashMap;
+use crate::ir::hash::{HashMap, Hasher};
 use crate::ir::{Func, Op, Value};
 use abi::Slot;
-use std::hash::{BuildHasher, BuildHasherDefault, DefaultHasher};
+use std::hash::BuildHasher;
 
 /// Isomorphic operations, one for each repetition.
 #[derive(Clone, PartialEq, Debug)]
@@ -108,17 +108,20 @@ impl<'a> Search<'a> {
         }
         let mut values: Vec<Value> = lists.into_iter().flatten().copied().collect();
         values.sort_unstable();
-        let hasher = BuildHasherDefault::<DefaultHasher>::default();
+        let hasher = Hasher::default();
         let [mut exact, mut shape] = [(); 2].map(|()| Vec::with_capacity(list.len()));
         let mut depth = Vec::with_capacity(list.len());
         for (op, list) in func.ops.iter().zip(&list) {
             let hash = |kind: Op, known: &[u64]| {
-                let mut operands = Vec::new();
-                op.each_operand(|operand| operands.push(known[operand.index()]));
+                let (mut operands, mut count) = ([0; 3], 0);
+                op.each_operand(|operand| {
+                    operands[count] = known[operand.index()];
+                    count += 1;
+                });
                 if let Some(commutative) = commutative(*op) {
                     operands[..commutative].sort_unstable();
                 }
-                hasher.hash_one((kind, operands, list))
+                hasher.hash_one((kind, &operands[..count], list))
             };
             exact.push(hash(kind(*op), &exact));
             shape.push(match op {
@@ -206,12 +209,17 @@ impl<'a> Search<'a> {
     /// The operands of isomorphic operations, operand by operand. Commutative operands are exchanged to match the first
     /// member.
     fn aligned(&self, members: &[Value]) -> Vec<Vec<Value>> {
-        let of = |member: Value| -> Vec<Value> { self.func.reads(self.func.op(member)).collect() };
-        let first = of(members[0]);
-        let mut all: Vec<Vec<Value>> = first.iter().map(|operand| vec![*operand]).collect();
+        let of = |member: Value| self.func.reads(self.func.op(member));
+        let row = |first: Value| {
+            let mut row = Vec::with_capacity(members.len());
+            row.push(first);
+            row
+        };
+        let mut all: Vec<Vec<Value>> = of(members[0]).map(row).collect();
         let commutative = commutative(self.func.op(members[0])).is_some();
         for member in &members[1..] {
-            let mut operands = of(*member);
+            let mut operands = [Value(0); 3];
+            operands.iter_mut().zip(of(*member)).for_each(|(to, operand)| *to = operand);
             if commutative && self.exchanged([&all[0], &all[1]], [operands[0], operands[1]]) {
                 operands.swap(0, 1);
             }

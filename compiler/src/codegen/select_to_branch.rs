@@ -9,10 +9,14 @@
 
 use crate::ir::cfg::{Block, BlockId, Cfg, Part, Run, Target, Terminator};
 use crate::ir::hash::{HashMap, HashSet};
+use crate::ir::value_map::{ValueMap, ValueSet};
 use crate::ir::{Op, Value};
 
 /// Turns selects of all blocks into branches.
 pub fn select_to_branch(cfg: &mut Cfg) {
+    if !cfg.ops.iter().any(|op| matches!(op, Op::Select(..))) {
+        return;
+    }
     let mut straight: HashSet<BlockId> = HashSet::default();
     for piece in &cfg.pieces {
         let order = cfg.order(*piece);
@@ -20,6 +24,8 @@ pub fn select_to_branch(cfg: &mut Cfg) {
             straight.extend(order);
         }
     }
+    // Made once, because each run is short.
+    let (mut read, mut position) = (ValueSet::new(cfg.ops.len()), ValueMap::new(cfg.ops.len()));
     for (id, live_out) in cfg.live_out().into_iter().enumerate() {
         let id = BlockId(id as u32);
         if straight.contains(&id) {
@@ -29,16 +35,19 @@ pub fn select_to_branch(cfg: &mut Cfg) {
         let runs = Run::all(std::mem::take(&mut block.insts));
         let (part, end) = (block.part, std::mem::replace(&mut block.end, Terminator::Return(None)));
         // What is read after each run, from the end of the block.
-        let mut read: HashSet<Value> = live_out.into_iter().chain(cfg.end_uses(&end)).collect();
-        let mut outputs: Vec<Vec<Value>> = Vec::new();
+        read.clear();
+        read.add(live_out.into_iter().chain(cfg.end_uses(&end)));
+        let mut outputs: Vec<Vec<usize>> = Vec::new();
         for run in runs.iter().rev() {
-            read.extend(run.effect.iter().flat_map(|inst| cfg.uses(inst)));
-            outputs.push(run.list.iter().copied().filter(|value| read.contains(value)).collect());
-            read.extend(run.list.iter().flat_map(|value| cfg.uses(&run.inst(*value))));
+            read.add(run.effect.iter().flat_map(|inst| cfg.uses(inst)));
+            outputs.push((0..run.list.len()).filter(|at| read.contains(run.list[*at])).collect());
+            read.add(run.list.iter().flat_map(|value| cfg.uses(&run.inst(*value))));
         }
         let mut at = id;
         for (run, outputs) in runs.into_iter().zip(outputs.into_iter().rev()) {
-            let regions = BranchRegions::of(|value| run.op(&cfg.ops, value), &run.list, &outputs);
+            position.clear();
+            run.list.iter().enumerate().for_each(|(at, value)| _ = position.insert(*value, at));
+            let regions = BranchRegions::of(|value| run.op(&cfg.ops, value), &run.list, &position, &outputs);
             at = write(cfg, (&run, &regions, 0), part, at);
             cfg.blocks[at.index()].insts.extend(run.effect);
         }
@@ -99,8 +108,9 @@ const EXPENSIVE_ARM: u32 = 4;
 const MAX_DEPTH: usize = 24;
 
 impl BranchRegions {
-    /// The regions of a list of operations, of which `outputs` are read elsewhere.
-    fn of(op: impl Fn(Value) -> Op, list: &[Value], outputs: &[Value]) -> BranchRegions {
+    /// The regions of a list of operations; `position`: of each value in it. Those at the positions `outputs` are read
+    /// elsewhere.
+    fn of(op: impl Fn(Value) -> Op, list: &[Value], position: &ValueMap<usize>, outputs: &[usize]) -> BranchRegions {
         // A region belongs to one arm of a select; region 0 to none.
         struct Region {
             select: Value,
@@ -110,8 +120,8 @@ impl BranchRegions {
         }
         let mut regions = vec![Region { select: Value(0), within: 0, depth: 0, cost: 0 }];
         let mut arms: HashMap<Value, [usize; 2]> = HashMap::default();
-        // The innermost region that contains all uses of a value seen so far; none: no use yet.
-        let mut region_of: HashMap<Value, Option<usize>> = list.iter().map(|value| (*value, None)).collect();
+        // For each position, the innermost region that contains all uses seen so far; none: no use yet.
+        let mut region_of: Vec<Option<usize>> = vec![None; list.len()];
         let common = |regions: &[Region], mut a: usize, mut b: usize| {
             while a != b {
                 if regions[a].depth >= regions[b].depth { a = regions[a].within } else { b = regions[b].within }
@@ -119,27 +129,22 @@ impl BranchRegions {
             a
         };
         // Values that are read elsewhere are computed unconditionally.
-        for output in outputs {
-            if let Some(region) = region_of.get_mut(output) {
-                *region = Some(0);
-            }
-        }
+        outputs.iter().for_each(|at| region_of[*at] = Some(0));
         let (merged, mut followers) = (merged(&op, list), HashSet::default());
         followers.extend(merged.values().flat_map(|selects| &selects[1..]).copied());
-        for value in list.iter().rev() {
+        for (at, value) in list.iter().enumerate().rev() {
             if followers.contains(value) {
                 continue;
             }
             let selects = merged.get(value).map_or(std::slice::from_ref(value), |selects| selects);
-            let uses = selects.iter().filter_map(|select| region_of[select]);
-            let own = uses.reduce(|a, b| common(&regions, a, b)).unwrap_or(0);
-            for select in selects {
-                region_of.insert(*select, Some(own));
-                regions[own].cost += op(*select).effort();
-            }
-            let mut used = |operand: Value, at: usize, regions: &[Region]| {
-                if let Some(known) = region_of.get_mut(&operand) {
-                    *known = Some(known.map_or(at, |known| common(regions, known, at)));
+            // Merged selects are adjacent.
+            let of_selects = &mut region_of[at..at + selects.len()];
+            let own = of_selects.iter().filter_map(|of| *of).reduce(|a, b| common(&regions, a, b)).unwrap_or(0);
+            of_selects.fill(Some(own));
+            regions[own].cost += selects.iter().map(|select| op(*select).effort()).sum::<u32>();
+            let mut used = |operand: Value, by: usize, regions: &[Region]| {
+                if let Some(at) = position.get(operand) {
+                    region_of[at] = Some(region_of[at].map_or(by, |known| common(regions, known, by)));
                 }
             };
             match op(*value) {
@@ -200,8 +205,8 @@ impl BranchRegions {
             region
         };
         let mut members = vec![Vec::new(); regions.len()];
-        for value in list {
-            members[enclosing(region_of[value].unwrap_or(0))].push(*value);
+        for (value, region) in list.iter().zip(region_of) {
+            members[enclosing(region.unwrap_or(0))].push(*value);
         }
         BranchRegions { members, arms, merged }
     }

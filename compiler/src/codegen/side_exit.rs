@@ -9,7 +9,7 @@
 
 use crate::ir::cfg::{Block, BlockId, Cfg, Inst, Part, Target, Terminator};
 use crate::ir::hash::{HashMap, HashSet};
-use crate::ir::{Func, Op, Type, Value};
+use crate::ir::{Func, Op, Value};
 
 /// The value that is tested after a step, and the value that matters only if that test fails.
 pub fn tested(func: &Func) -> (Option<Value>, Option<Value>) {
@@ -43,42 +43,40 @@ fn reads_memory(op: Op) -> bool {
 
 /// Gives each block that ends with such a status a side exit.
 pub fn side_exit(cfg: &mut Cfg) {
-    let types = cfg.types();
-    let live_out = cfg.live_out();
-    for (id, live) in live_out.into_iter().enumerate() {
-        let end = &cfg.blocks[id].end;
-        let status = match end {
-            Terminator::Return(Some(status)) => *status,
-            Terminator::Branch { when, .. } if types[when.index()] == Type::Int => *when,
-            _ => continue,
-        };
+    if !cfg.blocks.iter().any(|block| status(cfg, &block.end).is_some()) {
+        return;
+    }
+    for (id, live) in cfg.live_out().into_iter().enumerate() {
+        let Some(status) = status(cfg, &cfg.blocks[id].end) else { continue };
         // Where the status is a parameter, another block has computed it.
         let is_computed = cfg.blocks[id].insts.contains(&Inst::Compute(status));
         if let Some((when, is, detail)) = Func::failure_of(&cfg.ops, status).filter(|_| is_computed) {
-            let live = live.into_iter().filter(|value| *value != status).chain([when]).collect();
-            split(cfg, BlockId(id as u32), live, (status, when, is, detail));
+            let mut needed = vec![false; cfg.ops.len()];
+            live.iter().filter(|value| **value != status).chain([&when]).for_each(|value| needed[value.index()] = true);
+            split(cfg, BlockId(id as u32), needed, (status, when, is, detail));
         }
     }
 }
 
-/// Splits one block. `needed`: the values that must be computed in any case.
-fn split(
-    cfg: &mut Cfg,
-    id: BlockId,
-    mut needed: HashSet<Value>,
-    (status, when, is, detail): (Value, Value, bool, Value),
-) {
+/// The value that decides the end of a block, if it may be a status: a failed guard selects it.
+fn status(cfg: &Cfg, end: &Terminator) -> Option<Value> {
+    let (Terminator::Return(Some(status)) | Terminator::Branch { when: status, .. }) = end else { return None };
+    Func::failure_of(&cfg.ops, *status).map(|_| *status)
+}
+
+/// Splits one block. `needed`: for each value, whether it must be computed in any case.
+fn split(cfg: &mut Cfg, id: BlockId, mut needed: Vec<bool>, (status, when, is, detail): (Value, Value, bool, Value)) {
     let mut block = cfg.blocks[id.index()].clone();
     if let Terminator::Branch { no, .. } = &block.end {
-        needed.extend(&no.args);
+        no.args.iter().for_each(|arg| needed[arg.index()] = true);
     }
     let (mut kept, mut moved) = (Vec::new(), Vec::new());
     let mut stored: HashMap<Value, Inst> = HashMap::default();
     for inst in std::mem::take(&mut block.insts).into_iter().rev() {
         let is_needed = match &inst {
-            Inst::Compute(value) => needed.contains(value) || reads_memory(cfg.op(*value)),
+            Inst::Compute(value) => needed[value.index()] || reads_memory(cfg.op(*value)),
             // The instructions before use the value of before.
-            Inst::Reload(value, _) => needed.remove(value),
+            Inst::Reload(value, _) => std::mem::take(&mut needed[value.index()]),
             Inst::Store(place, value) => {
                 if !matches!(cfg.op(*value), Op::Load(_)) && place.stride == 0 {
                     stored.insert(*value, Inst::Reload(*value, *place));
@@ -90,9 +88,9 @@ fn split(
         if is_needed {
             // All operands, also a table entry of which only the bits are read: its index is needed here.
             if let Inst::Compute(value) = inst {
-                cfg.op(value).each_operand(|operand| _ = needed.insert(operand));
+                cfg.op(value).each_operand(|operand| needed[operand.index()] = true);
             }
-            needed.extend(cfg.uses(&inst));
+            cfg.uses(&inst).for_each(|value| needed[value.index()] = true);
             kept.push(inst);
         } else if inst != Inst::Compute(status) {
             moved.push(inst);

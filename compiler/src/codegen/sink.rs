@@ -7,28 +7,30 @@
 //! Compare LLVM's `Sink` pass; Knoop, Rüthing, Steffen, *Partial Dead Code Elimination*, PLDI 1994.
 
 use crate::ir::cfg::{Cfg, Part, Run};
-use crate::ir::hash::HashMap;
+use crate::ir::value_map::ValueMap;
 use crate::ir::{Op, Value};
 
 /// Sinks cheap operations in all blocks that are not cold.
 pub fn sink(cfg: &mut Cfg) {
+    let mut position = ValueMap::new(cfg.ops.len());
     for block in cfg.blocks.iter_mut().filter(|block| block.part != Part::Cold) {
         for run in Run::all(std::mem::take(&mut block.insts)) {
-            let sunk = sunk(|value| run.op(&cfg.ops, value), &run.list);
+            let sunk = sunk(|value| run.op(&cfg.ops, value), &run.list, &mut position);
             block.insts.extend(sunk.into_iter().map(|value| run.inst(value)));
             block.insts.extend(run.effect);
         }
     }
 }
 
-/// The list, with cheap operations sunk to their first use.
-fn sunk(op: impl Fn(Value) -> Op, list: &[Value]) -> Vec<Value> {
-    let position: HashMap<Value, usize> = list.iter().enumerate().map(|(at, value)| (*value, at)).collect();
+/// The list, with cheap operations sunk to their first use. `position`: a map for the position of each value.
+fn sunk(op: impl Fn(Value) -> Op, list: &[Value], position: &mut ValueMap<usize>) -> Vec<Value> {
+    position.clear();
+    list.iter().enumerate().for_each(|(at, value)| _ = position.insert(*value, at));
     let mut sinkable = vec![false; list.len()];
     for (at, value) in list.iter().enumerate() {
         let mut can_sink = op(*value).effort() <= 1 && !matches!(op(*value), Op::Select(..));
         // An operand outside the list is a constant, or stays available in any case.
-        op(*value).each_operand(|operand| can_sink &= position.get(&operand).is_none_or(|at| sinkable[*at]));
+        op(*value).each_operand(|operand| can_sink &= position.get(operand).is_none_or(|at| sinkable[at]));
         sinkable[at] = can_sink;
     }
     // Position of the first use of each operation; the end if there is none in the list.
@@ -36,8 +38,8 @@ fn sunk(op: impl Fn(Value) -> Op, list: &[Value]) -> Vec<Value> {
     for (at, value) in list.iter().enumerate().rev() {
         let here = if sinkable[at] { first_use[at] } else { run_start(&op, list, at) };
         op(*value).each_operand(|operand| {
-            if let Some(of) = position.get(&operand) {
-                first_use[*of] = first_use[*of].min(here);
+            if let Some(of) = position.get(operand) {
+                first_use[of] = first_use[of].min(here);
             }
         });
     }
@@ -76,13 +78,13 @@ mod tests {
         let product = build.mul(first_use, second);
         let result = build.fma(product, product, sum);
         let list: Vec<Value> = (0..build.ops().len() as u32).map(Value).collect();
-        let ordered = sunk(|value| build.get(value), &list);
+        let ordered = sunk(|value| build.get(value), &list, &mut ValueMap::new(build.ops().len()));
         assert_eq!(ordered, [x, y, z, sum, less, first_use, second, product, result]);
         let w = build.load(Slot(6));
         let more = build.add(w, w);
         let last = build.mul(result, more);
         let list = [w, more, x, y, z, sum, less, first_use, second, product, result, last];
-        let ordered = sunk(|value| build.get(value), &list);
+        let ordered = sunk(|value| build.get(value), &list, &mut ValueMap::new(build.ops().len()));
         assert_eq!(ordered, [x, y, z, sum, less, first_use, second, product, result, w, more, last]);
     }
 }

@@ -170,6 +170,9 @@ pub fn specialise_modes(cfg: &mut Cfg) {
             of_slot.push(bits);
         }
     }
+    if modes.is_empty() {
+        return;
+    }
     for id in 0..cfg.blocks.len() as u32 {
         let is_body = cfg.blocks[id as usize].part == Part::Body;
         if let Some(func) = cfg.straight_line(BlockId(id)).filter(|_| is_body) {

@@ -85,8 +85,11 @@ impl<'a> FunctionCompiler<'a> {
     /// Compiles a step for single iterations whose expressions of parameters and step length are hoisted, see
     /// `hoist_params`. `layout`: that of the blocks. None if single iterations have no code of their own.
     pub fn prepared(&mut self, func: &Func, layout: &Layout) -> Result<Option<PreparedBytes>, Unsupported> {
+        if self.is_long(func) || is_idempotent(func) {
+            return Ok(None);
+        }
         let graphs = self.graphs(func, Some(layout))?;
-        let [single, _] = &graphs[..] else { return Ok(None) };
+        let single = &graphs[0];
         let Parts { all: bytes, loop_offset } = self.parts(func, &graphs)?;
         let (mut prepare, mut len) = (None, 0);
         if let Some(entry) = single.prepare {
@@ -111,11 +114,16 @@ impl<'a> FunctionCompiler<'a> {
         self.compile_context(func)
     }
 
+    /// Whether a function is divided into pieces.
+    fn is_long(&self, func: &Func) -> bool {
+        func.ops.len() > self.options.lengths.max_function
+    }
+
     /// The graphs of a function: that of a single iteration, if it has code of its own, and that of any number.
     fn graphs(&self, func: &Func, layout: Option<&Layout>) -> Result<Vec<Cfg>, Unsupported> {
         let context = Passes { layout, options: &self.options };
         let graph = |form, called| passes::run(func, form, called, &context);
-        if func.ops.len() > self.options.lengths.max_function {
+        if self.is_long(func) {
             let long = graph(Form::Long, Entry::Several);
             return if long.pieces.is_empty() { Err(too_large(func)) } else { Ok(vec![long]) };
         }

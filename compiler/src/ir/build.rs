@@ -11,6 +11,7 @@ use super::{Binary, Func, Op, Type, Unary, Value, Write};
 use crate::ir::hash::HashMap;
 use abi::Slot;
 use std::collections::BTreeMap;
+use std::collections::hash_map::Entry;
 use std::sync::Arc;
 
 /// The current value of each slot while functions are composed. A slot without an entry still has its initial value.
@@ -35,9 +36,19 @@ impl Build {
         Build { name: name.into(), ..Build::default() }
     }
 
+    /// As [`new`](Build::new), with room for about so many operations.
+    pub fn roomy(name: &str, operations: usize) -> Build {
+        let mut build = Build::new(name);
+        build.ops.reserve(operations);
+        build.types.reserve(operations);
+        build.known.reserve(operations);
+        build
+    }
+
     /// A builder that contains the operations of `func` under their old numbers, but not its stores, writes and status.
     pub fn of(func: &Func) -> Build {
-        let mut build = Build { ops: func.ops.clone(), ..Build::new(&func.name) };
+        let mut build = Build::roomy(&func.name, func.ops.len());
+        build.ops.extend(&func.ops);
         build.types = types(func).expect("the function is sound");
         for (i, op) in func.ops.iter().enumerate() {
             build.known.entry(*op).or_insert(Value(i as u32));
@@ -150,16 +161,16 @@ impl Build {
     }
 
     fn share(&mut self, op: Op) -> Value {
-        if let Some(value) = self.known.get(&op) {
-            return *value;
-        }
+        let entry = match self.known.entry(op) {
+            Entry::Occupied(entry) => return *entry.get(),
+            Entry::Vacant(entry) => entry,
+        };
         let of = |value: Value| self.types[value.index()];
         let of_type = result(op, of).unwrap_or_else(|what| panic!("{}: v{} = {op} {what}", self.name, self.ops.len()));
         let value = Value(u32::try_from(self.ops.len()).expect("fewer than 2^32 operations"));
         self.ops.push(op);
         self.types.push(of_type);
-        self.known.insert(op, value);
-        value
+        *entry.insert(value)
     }
 
     /// The constant result of an operation on constants.
@@ -401,10 +412,15 @@ impl Build {
 
 /// Dead code elimination: the same function without operations that no result needs.
 pub fn prune(func: &Func) -> Func {
-    let live = func.live();
-    let mut moved = vec![Value(u32::MAX); func.ops.len()];
+    prune_to(func, &func.ops, &func.live())
+}
+
+/// As [`prune`]: the function whose stores, writes and status are those of `func` and whose operations are those of `all`
+/// that are live.
+pub fn prune_to(func: &Func, all: &[Op], live: &[bool]) -> Func {
+    let mut moved = vec![Value(u32::MAX); all.len()];
     let mut ops = Vec::with_capacity(live.iter().filter(|live| **live).count());
-    for (i, op) in func.ops.iter().enumerate().filter(|(i, _)| live[*i]) {
+    for (i, op) in all.iter().enumerate().filter(|(i, _)| live[*i]) {
         moved[i] = Value(ops.len() as u32);
         ops.push(op.map(|operand| moved[operand.index()]));
     }

@@ -8,10 +8,10 @@
 //! Source: Aho, Lam, Sethi, Ullman, *Compilers*, 2007, ch. 8.4 and 9.6; block parameters instead of φ-functions as in
 //! Cranelift and MLIR.
 
-use super::{Func, Op, Type, Value, Write, build, reads, verify};
-use crate::ir::hash::{HashMap, HashSet};
+use super::{Func, Op, Type, Value, Write, build, live, reads, verify};
+use crate::ir::hash::HashMap;
+use crate::ir::value_map::{ValueMap, ValueSet};
 use abi::{Layout, Slot};
-use std::collections::BTreeSet;
 
 /// The block with this number; prints as `b3`.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Debug)]
@@ -263,11 +263,11 @@ impl Cfg {
     pub fn straight_line(&self, block: BlockId) -> Option<Func> {
         let block = &self.blocks[block.index()];
         let Terminator::Return(status) = block.end else { return None };
-        let mut func = Func { name: self.name.clone(), ops: self.ops.clone(), status, ..Func::default() };
-        let mut computed: HashSet<Value> = HashSet::default();
+        let mut func = Func { name: self.name.clone(), status, ..Func::default() };
+        let mut computed = ValueSet::new(self.ops.len());
         for inst in &block.insts {
             match inst {
-                Inst::Compute(value) => _ = computed.insert(*value),
+                Inst::Compute(value) => _ = computed.insert(*value, ()),
                 Inst::Store(Place { area: Area::Block, index, stride: 0 }, value) => {
                     func.stores.push((Slot(*index), *value));
                 }
@@ -275,10 +275,11 @@ impl Cfg {
                 Inst::Store(..) | Inst::Reload(..) | Inst::Call(_) => return None,
             }
         }
+        let live = live(&self.ops, func.results());
         let complete =
-            |(i, live): (usize, &bool)| !live || computed.contains(&Value(i as u32)) || self.is_free(Value(i as u32));
-        let whole = block.params.is_empty() && func.live().iter().enumerate().all(complete);
-        whole.then(|| build::prune(&func))
+            |(i, live): (usize, &bool)| !live || computed.contains(Value(i as u32)) || self.is_free(Value(i as u32));
+        let whole = block.params.is_empty() && live.iter().enumerate().all(complete);
+        whole.then(|| build::prune_to(&func, &self.ops, &live))
     }
 
     /// The operation that defines a value.
@@ -296,15 +297,15 @@ impl Cfg {
     }
 
     /// The values that an instruction reads, except those that are available everywhere.
-    pub fn uses(&self, inst: &Inst) -> Vec<Value> {
-        let mut uses: Vec<Value> = match inst {
-            Inst::Compute(value) => reads(&self.ops, self.op(*value)).collect(),
-            Inst::Store(_, value) => vec![*value],
-            Inst::Write(write) => vec![write.index, write.value],
-            Inst::Reload(..) | Inst::Call(_) => Vec::new(),
+    pub fn uses(&self, inst: &Inst) -> impl Iterator<Item = Value> + use<'_> {
+        let (operation, given) = match inst {
+            Inst::Compute(value) => (Some(self.op(*value)), [None; 2]),
+            Inst::Store(_, value) => (None, [Some(*value), None]),
+            Inst::Write(write) => (None, [Some(write.index), Some(write.value)]),
+            Inst::Reload(..) | Inst::Call(_) => (None, [None; 2]),
         };
-        uses.retain(|value| !self.is_free(*value));
-        uses
+        let operands = operation.into_iter().flat_map(|op| reads(&self.ops, op));
+        operands.chain(given.into_iter().flatten()).filter(|value| !self.is_free(*value))
     }
 
     /// The values that the end of a block reads, except those that are available everywhere.
@@ -347,9 +348,12 @@ impl Cfg {
 
     /// Drops unreachable blocks, and operations that nothing needs.
     pub fn compact(&mut self) {
-        let kept: BTreeSet<BlockId> = self.entries().flat_map(|(entry, _)| self.order(entry)).collect();
-        let blocks: Vec<BlockId> = kept.into_iter().collect();
-        let number = |old: BlockId| BlockId(blocks.binary_search(&old).expect("it is reached") as u32);
+        let mut blocks: Vec<BlockId> = self.entries().flat_map(|(entry, _)| self.order(entry)).collect();
+        blocks.sort_unstable();
+        blocks.dedup();
+        let mut numbers = vec![BlockId(u32::MAX); self.blocks.len()];
+        blocks.iter().enumerate().for_each(|(k, old)| numbers[old.index()] = BlockId(k as u32));
+        let number = |old: BlockId| numbers[old.index()];
         let mut live = vec![false; self.ops.len()];
         for block in &blocks {
             let block = &self.blocks[block.index()];
@@ -428,31 +432,67 @@ impl Cfg {
         dominators
     }
 
-    /// For each block the values that it hands to blocks after it, arguments not included: backward liveness.
-    pub fn live_out(&self) -> Vec<BTreeSet<Value>> {
-        let mut live_in: Vec<BTreeSet<Value>> = vec![BTreeSet::new(); self.blocks.len()];
-        let mut live_out = live_in.clone();
+    /// For each block the values that it hands to blocks after it, arguments not included, ascending: backward liveness
+    /// of the values that some block reads and does not compute before. Most values are read only in the block that
+    /// computes them. Briggs, Cooper, Harvey, Simpson, *Practical Improvements to the Construction and Destruction of
+    /// Static Single Assignment Form*, 1998, call the others global names.
+    pub fn live_out(&self) -> Vec<Vec<Value>> {
         let order: Vec<BlockId> = self.entries().flat_map(|(entry, _)| self.order(entry)).collect();
-        let mut changed = true;
+        if order.len() < 2 {
+            return vec![Vec::new(); self.blocks.len()];
+        }
+        // What a block reads from others, what it computes itself.
+        let mut read: Vec<Vec<Value>> = vec![Vec::new(); self.blocks.len()];
+        let mut own = ValueSet::new(self.ops.len());
+        for id in &order {
+            let block = &self.blocks[id.index()];
+            own.clear();
+            own.add(block.params.iter().copied());
+            let read = &mut read[id.index()];
+            for inst in &block.insts {
+                read.extend(self.uses(inst).filter(|value| !own.contains(*value)));
+                own.add(inst.defines());
+            }
+            read.extend(self.end_uses(&block.end).into_iter().filter(|value| !own.contains(*value)));
+        }
+        let mut global: Vec<Value> = read.iter().flatten().copied().collect();
+        global.sort_unstable();
+        global.dedup();
+        let mut number = ValueMap::new(self.ops.len());
+        global.iter().enumerate().for_each(|(k, value)| _ = number.insert(*value, k));
+        // A bit for each global value.
+        let words = global.len().div_ceil(64);
+        let bits = |values: &mut dyn Iterator<Item = Value>| {
+            let mut bits = vec![0u64; words];
+            values.filter_map(|value| number.get(value)).for_each(|k| bits[k / 64] |= 1 << (k % 64));
+            bits
+        };
+        let read: Vec<Vec<u64>> = read.into_iter().map(|values| bits(&mut values.into_iter())).collect();
+        let own =
+            |block: &Block| bits(&mut block.params.iter().copied().chain(block.insts.iter().filter_map(Inst::defines)));
+        let own: Vec<Vec<u64>> = self.blocks.iter().map(own).collect();
+        let (mut live_in, mut live_out) = (read.clone(), vec![vec![0u64; words]; self.blocks.len()]);
+        let mut changed = words > 0;
         while std::mem::take(&mut changed) {
-            for id in order.iter().rev() {
-                let block = &self.blocks[id.index()];
-                let mut live = BTreeSet::new();
-                block.end.each_target(&mut |target, _| live.extend(&live_in[target.index()]));
-                live_out[id.index()].clone_from(&live);
-                live.extend(self.end_uses(&block.end));
-                for inst in block.insts.iter().rev() {
-                    if let Inst::Compute(value) | Inst::Reload(value, _) = inst {
-                        live.remove(value);
-                    }
-                    live.extend(self.uses(inst));
+            for id in order.iter().rev().map(|id| id.index()) {
+                self.blocks[id].end.each_target(&mut |target, _| {
+                    live_out[id].iter_mut().zip(&live_in[target.index()]).for_each(|(out, live)| *out |= live);
+                });
+                for word in 0..words {
+                    let live = read[id][word] | live_out[id][word] & !own[id][word];
+                    changed |= std::mem::replace(&mut live_in[id][word], live) != live;
                 }
-                block.params.iter().for_each(|param| _ = live.remove(param));
-                changed |= live != live_in[id.index()];
-                live_in[id.index()] = live;
             }
         }
-        live_out
+        let values = |bits: Vec<u64>| {
+            global
+                .iter()
+                .enumerate()
+                .filter(|(k, _)| bits[k / 64] >> (k % 64) & 1 != 0)
+                .map(|(_, value)| *value)
+                .collect()
+        };
+        live_out.into_iter().map(values).collect()
     }
 
     /// Number of operations that its blocks compute.
@@ -526,6 +566,14 @@ impl Run {
 }
 
 impl Inst {
+    /// The value that is available after the instruction.
+    pub fn defines(&self) -> Option<Value> {
+        match self {
+            Inst::Compute(value) | Inst::Reload(value, _) => Some(*value),
+            Inst::Store(..) | Inst::Write(_) | Inst::Call(_) => None,
+        }
+    }
+
     /// Calls `f` with each value that the instruction names.
     pub fn each_value(&self, f: &mut dyn FnMut(Value)) {
         match self {

@@ -98,7 +98,7 @@ fn paths(cfg: &Cfg, entry: BlockId) -> Result<(), String> {
             };
             let mut late = None;
             for inst in &block.insts {
-                check(cfg.uses(inst), &now);
+                check(cfg.uses(inst).collect(), &now);
                 match inst {
                     Inst::Compute(value) => {
                         if let Op::Load(slot) = cfg.op(*value)

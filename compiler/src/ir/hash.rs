@@ -7,3 +7,5 @@
 pub type HashMap<K, V> = rustc_hash::FxHashMap<K, V>;
 /// A set.
 pub type HashSet<K> = rustc_hash::FxHashSet<K>;
+/// Makes the hash of a single value.
+pub type Hasher = rustc_hash::FxBuildHasher;

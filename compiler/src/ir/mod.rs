@@ -12,6 +12,7 @@ pub mod verify;
 pub mod eval;
 pub mod build;
 pub mod partial_eval;
+pub mod value_map;
 pub mod variance;
 pub mod cfg;
 pub mod cfg_text;
@@ -210,8 +211,20 @@ pub fn reads(ops: &[Op], op: Op) -> impl Iterator<Item = Value> + use<> {
     operands.into_iter().flatten()
 }
 
+/// For each operation, whether one of these values needs it.
+pub fn live(ops: &[Op], values: impl Iterator<Item = Value>) -> Vec<bool> {
+    let mut live = vec![false; ops.len()];
+    values.for_each(|value| live[value.index()] = true);
+    for i in (0..ops.len()).rev() {
+        if live[i] {
+            ops[i].each_operand(|operand| live[operand.index()] = true);
+        }
+    }
+    live
+}
+
 /// A write to slot `base + min(index as unsigned, len − 1)` of a ring buffer, after all stores.
-#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+#[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
 pub struct Write {
     /// First slot of the ring.
     pub base: Slot,
@@ -224,7 +237,7 @@ pub struct Write {
 }
 
 /// A straight-line function over a block of slots. It behaves as if it performed all loads first and all stores last.
-#[derive(Clone, PartialEq, Debug, Default)]
+#[derive(Clone, PartialEq, Hash, Debug, Default)]
 pub struct Func {
     /// The name in listings.
     pub name: String,
@@ -379,14 +392,7 @@ impl Func {
 
     /// Liveness with respect to these values alone.
     pub fn live_for(&self, values: impl Iterator<Item = Value>) -> Vec<bool> {
-        let mut live = vec![false; self.ops.len()];
-        values.for_each(|value| live[value.index()] = true);
-        for i in (0..self.ops.len()).rev() {
-            if live[i] {
-                self.ops[i].each_operand(|operand| live[operand.index()] = true);
-            }
-        }
-        live
+        live(&self.ops, values)
     }
 
     /// The slots that the function loads, ascending and without duplicates. Ring reads are not included.

@@ -56,7 +56,7 @@ pub fn expand_for_lanes(func: &Func, kept: &[Unary]) -> Func {
 /// Replaces each function of one argument by the result of `by`; `None` keeps the function. The last argument of `by`:
 /// whether the argument is known to be at most 0, or NaN.
 fn expand_by(func: &Func, by: &dyn for<'a> Fn(Unary, Real<'a>, bool) -> Option<Real<'a>>) -> Func {
-    let build = Shared::new(Build::new(&func.name).with_pool(POOL.as_slice().into()));
+    let build = Shared::new(Build::roomy(&func.name, 2 * func.ops.len()).with_pool(POOL.as_slice().into()));
     let mut values: Vec<Value> = Vec::with_capacity(func.ops.len());
     for (op, live) in func.ops.iter().zip(func.live()) {
         let at = |operand: Value| Real::new(&build, values[operand.index()]);

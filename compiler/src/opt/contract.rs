@@ -27,7 +27,7 @@ use abi::Layout;
 /// Fuses every product that may be fused. `layout`: the block that the function works on.
 pub fn contract(func: &Func, layout: &Layout) -> Func {
     let (uses, chain) = (uses(func), Dependence::of(func, layout));
-    let mut build = Build::new(&func.name);
+    let mut build = Build::roomy(&func.name, func.ops.len());
     let mut values: Vec<Value> = Vec::with_capacity(func.ops.len());
     // The factors of a product that has one use.
     let product = |value: Value| match func.op(value) {

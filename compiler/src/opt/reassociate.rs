@@ -134,7 +134,7 @@ struct Product {
 
 impl<'a> Pass<'a> {
     fn new(func: &Func, carried: &'a HashSet<Slot>, balanced: bool) -> Pass<'a> {
-        Pass { build: Build::new(&func.name), ready: Vec::new(), carried, balanced }
+        Pass { build: Build::roomy(&func.name, func.ops.len()), ready: Vec::new(), carried, balanced }
     }
 
     fn op(&mut self, op: Op) -> Value {
