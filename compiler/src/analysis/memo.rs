@@ -48,16 +48,11 @@ impl<T: Clone> Default for Memo<T> {
     }
 }
 
-/// A hash of everything that a program computes: its functions as printed, its numbers by their bits, its ranges.
+/// A hash of everything that a program computes: its functions, its numbers by their bits, its ranges.
 fn key(program: &Program, also: &[u64]) -> u64 {
     let mut hasher = DefaultHasher::new();
-    for func in [Some(&program.start), Some(&program.outputs), Some(&program.derivatives)]
-        .into_iter()
-        .chain([program.tick.as_ref(), program.transitions.as_ref()])
-        .flatten()
-    {
-        func.to_string().hash(&mut hasher);
-    }
+    let functions = [&program.start, &program.outputs, &program.derivatives];
+    (functions, &program.tick, &program.transitions).hash(&mut hasher);
     for number in program.params.iter().chain(program.description.pool.iter()) {
         number.to_bits().hash(&mut hasher);
     }

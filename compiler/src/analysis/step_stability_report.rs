@@ -60,30 +60,10 @@ pub enum StepBy {
 /// Checks the step; returns at most one diagnostic of each kind.
 pub fn check(fixed: &Fixed, files: &Files) -> Vec<Diagnostic> {
     let ends = fixed.ends_at();
-    let Some(bench) = Bench::new(fixed.program, &ends) else { return Vec::new() };
-    let stable = |method: Method| bench.unstable(method, fixed.step).is_none();
-    // A chattering state is also unstable; the jump is the cause.
-    let look = || match bench.chatters(fixed.method, fixed.step) {
-        Some(chatter) => Finding::Chatters(chatter),
-        None => {
-            let unstable = bench.unstable(fixed.method, fixed.step);
-            // An instability within declared ranges is an error, which the warning must not replace.
-            let open = unstable.as_ref().is_none_or(|found| found.along.as_ref().is_some_and(|along| !along.closed));
-            let look = open && fixed.method == Method::Implicit;
-            match (look.then(|| bench.singular(fixed.step)).flatten(), unstable) {
-                (Some(singular), _) => Finding::Singular(singular),
-                (None, Some(unstable)) => {
-                    let implicit = fixed.method != Method::Implicit && stable(Method::Implicit);
-                    Finding::Unstable(unstable, implicit)
-                }
-                (None, None) => Finding::Nothing,
-            }
-        }
-    };
     static KNOWN: Memo<Finding> = Memo::new();
     let also: Vec<u64> =
         ends.iter().map(|slot| u64::from(slot.0)).chain([fixed.step.to_bits(), fixed.method as u64]).collect();
-    match KNOWN.answer(fixed.program, &also, look) {
+    match KNOWN.answer(fixed.program, &also, || Finding::of(fixed.program, &ends, fixed.method, fixed.step)) {
         Finding::Unstable(unstable, implicit) => vec![fixed.unstable(&unstable, implicit, files)],
         Finding::Singular(singular) => vec![fixed.singular(&singular)],
         Finding::Chatters(chatter) => vec![fixed.chatters(&chatter)],
@@ -98,6 +78,29 @@ enum Finding {
     Singular(Singular),
     Chatters(Chatter),
     Nothing,
+}
+
+impl Finding {
+    /// The finding for a program that is run in steps of one length.
+    fn of(program: &Program, ends: &[Slot], method: Method, step: f64) -> Finding {
+        let Some(bench) = Bench::new(program, ends) else { return Finding::Nothing };
+        // A chattering state is also unstable; the jump is the cause.
+        if let Some(chatter) = bench.chatters(method, step) {
+            return Finding::Chatters(chatter);
+        }
+        let unstable = bench.unstable(method, step);
+        // An instability within declared ranges is an error, which the warning must not replace.
+        let open = unstable.as_ref().is_none_or(|found| found.along.as_ref().is_some_and(|along| !along.closed));
+        let look = open && method == Method::Implicit;
+        match (look.then(|| bench.singular(step)).flatten(), unstable) {
+            (Some(singular), _) => Finding::Singular(singular),
+            (None, Some(unstable)) => {
+                let implicit = method != Method::Implicit && bench.unstable(Method::Implicit, step).is_none();
+                Finding::Unstable(unstable, implicit)
+            }
+            (None, None) => Finding::Nothing,
+        }
+    }
 }
 
 impl Fixed<'_> {

@@ -107,8 +107,8 @@ impl Fixed {
             return Ok(());
         }
         // Within a batch, a value may have become non-finite many steps ago, and that may be why a guard fired.
-        if check_finite(&self.rest.instance).is_err() {
-            return Err(self.first_not_finite());
+        if let Err(stop) = check_finite(&self.rest.instance) {
+            return Err(self.first_not_finite().unwrap_or(stop));
         }
         if status != 0 && !self.each {
             // Show the step that violated the guard, too.
@@ -117,17 +117,18 @@ impl Fixed {
         check_status(&self.rest.instance, status)
     }
 
-    /// Repeats the batch step by step up to the first state or output that is not finite.
-    fn first_not_finite(&mut self) -> Stop {
+    /// Repeats the batch step by step up to the first state or output that is not finite. None if all are finite this
+    /// time: a slice and the whole step may round an output differently, so that only one of them overflows.
+    fn first_not_finite(&mut self) -> Option<Stop> {
         let instance = &mut self.rest.instance;
         instance.block_mut().copy_from_slice(&self.saved);
         for _ in 0..self.batch {
             instance.advance_in_full();
             if let Err(stop) = check_finite(instance) {
-                return stop;
+                return Some(stop);
             }
         }
-        unreachable!("the same {} steps gave a value that is not finite before", self.batch)
+        None
     }
 }
 
