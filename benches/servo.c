@@ -33,19 +33,24 @@ void euler(double *state, const Params *params, double h, uint64_t count) {
     for (int i = 0; i < 5; i++) state[i] = x[i];
 }
 
+static inline void rk4_step(const Params *p, double x[5], double h) {
+    double y[5], k1[5], k2[5], k3[5], k4[5];
+    derivatives(p, x, k1);
+    for (int i = 0; i < 5; i++) y[i] = x[i] + h / 2 * k1[i];
+    derivatives(p, y, k2);
+    for (int i = 0; i < 5; i++) y[i] = x[i] + h / 2 * k2[i];
+    derivatives(p, y, k3);
+    for (int i = 0; i < 5; i++) y[i] = x[i] + h * k3[i];
+    derivatives(p, y, k4);
+    for (int i = 0; i < 5; i++) x[i] += h / 6 * (k1[i] + 2 * (k2[i] + k3[i]) + k4[i]);
+}
+
 void rk4(double *state, const Params *params, double h, uint64_t count) {
     Params p = *params;
-    double x[5], y[5], k1[5], k2[5], k3[5], k4[5];
+    double x[5];
     for (int i = 0; i < 5; i++) x[i] = state[i];
     for (uint64_t n = 0; n < count; n++) {
-        derivatives(&p, x, k1);
-        for (int i = 0; i < 5; i++) y[i] = x[i] + h / 2 * k1[i];
-        derivatives(&p, y, k2);
-        for (int i = 0; i < 5; i++) y[i] = x[i] + h / 2 * k2[i];
-        derivatives(&p, y, k3);
-        for (int i = 0; i < 5; i++) y[i] = x[i] + h * k3[i];
-        derivatives(&p, y, k4);
-        for (int i = 0; i < 5; i++) x[i] += h / 6 * (k1[i] + 2 * (k2[i] + k3[i]) + k4[i]);
+        rk4_step(&p, x, h);
     }
     for (int i = 0; i < 5; i++) state[i] = x[i];
 }
@@ -75,17 +80,10 @@ void euler_force(double *state, const Params *params, double h, uint64_t count) 
 void rk4_force(double *state, const Params *params, double h, uint64_t count) {
     volatile double *F = state + 5;
     Params p = *params;
-    double x[5], y[5], k1[5], k2[5], k3[5], k4[5];
+    double x[5];
     for (int i = 0; i < 5; i++) x[i] = state[i];
     for (uint64_t n = 0; n < count; n++) {
-        derivatives(&p, x, k1);
-        for (int i = 0; i < 5; i++) y[i] = x[i] + h / 2 * k1[i];
-        derivatives(&p, y, k2);
-        for (int i = 0; i < 5; i++) y[i] = x[i] + h / 2 * k2[i];
-        derivatives(&p, y, k3);
-        for (int i = 0; i < 5; i++) y[i] = x[i] + h * k3[i];
-        derivatives(&p, y, k4);
-        for (int i = 0; i < 5; i++) x[i] += h / 6 * (k1[i] + 2 * (k2[i] + k3[i]) + k4[i]);
+        rk4_step(&p, x, h);
         *F = force(&p, x);
     }
     for (int i = 0; i < 5; i++) state[i] = x[i];
