@@ -11,6 +11,7 @@ pub use compiler::analysis::explain::{Explanation, QuantityInfo, StepCost};
 pub use compiler::analysis::linearise::{Linear, Matrices, Ports};
 pub use compiler::analysis::step_stability::largest_stable;
 pub use compiler::analysis::step_stability_report::stable_up_to;
+pub use compiler::analysis::tuning::Tuned;
 pub use compiler::codegen::elementary::ElementaryFunction;
 use compiler::codegen::lanes;
 use compiler::codegen::target::{self, FunctionCompiler};

@@ -183,6 +183,11 @@ impl Rig {
             text("a recorded quantity", &series.label)?;
             unit_fits(&series.unit)?;
         }
+        let count = self.record.len();
+        for plot in &self.plots {
+            let outside = plot.series.iter().chain(&plot.against).find(|at| **at >= count);
+            ensure(outside.is_none(), || format!("a plot shows record {outside:?} of {count}"))?;
+        }
         let Some(at) = self.predict else { return Ok(()) };
         let gives = self.outputs.iter().any(|output| output.signal == Signal { node: at, what: SignalKind::Torque });
         ensure(gives, || format!("node {at} is to be predicted and gives no torque"))
@@ -305,7 +310,7 @@ fn program_fits(program: &Description) -> Fits {
 mod tests {
     use super::*;
     use crate::description::{Kind as QuantityKind, Layout, Quantity};
-    use crate::rig::{Bus, Plant, Stop};
+    use crate::rig::{Bus, Curves, Plant, Stop};
     use crate::series::Series;
 
     /// A drive and a device on two buses. Control and plant program have inputs 3 and 4 and outputs 5 and 6.
@@ -393,6 +398,7 @@ mod tests {
             overrun: Overrun::Hold(2),
             stops: vec![Stop { slot: Slot(6), condition: "v > 1".into(), why: "too fast".into() }],
             record: vec![Series { label: "v".into(), slot: Slot(5), unit: Unit::none(), boolean: false }],
+            plots: vec![Curves { series: vec![0], against: None }],
             predict: Some(0),
             needs_look: false,
             plant: Plant {
@@ -468,10 +474,12 @@ mod tests {
             ("its limits are", |rig| rig.outputs[0].slew = f64::NAN),
             ("to be predicted", |rig| rig.predict = Some(1)),
         ];
-        let more: [Change; 6] = [
+        let more: [Change; 8] = [
             ("two commands", |rig| rig.outputs.push(rig.outputs[0])),
             ("slot 9 of a block of 7", |rig| rig.stops[0].slot = Slot(9)),
             ("slot 9 of a block of 7", |rig| rig.record[0].slot = Slot(9)),
+            ("a plot shows record", |rig| rig.plots[0].series.push(1)),
+            ("a plot shows record", |rig| rig.plots[0].against = Some(1)),
             ("no input of the plant", |rig| rig.plant.applied[0].1 = Slot(5)),
             ("the plant program: slot 9", |rig| rig.plant.seen[0].1 = Slot(9)),
             ("an inertia", |rig| rig.plant.inertia = Some(0.0)),

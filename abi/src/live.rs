@@ -18,6 +18,17 @@ pub struct Live {
     pub params: Vec<Param>,
     /// The conditions, in the order in which a start reports violations.
     pub checks: Vec<Check>,
+    /// The parameters that the rig lets its operator set, in this order; all of them if there are none.
+    pub tuned: Vec<Tuned>,
+}
+
+/// `tune fr.Fs in 1 N .. 2 N`
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub struct Tuned {
+    /// Index into [`Live::params`].
+    pub param: usize,
+    /// Smallest and largest value that can be set, SI; infinite where the text gives no range.
+    pub range: (f64, f64),
 }
 
 /// A parameter.
@@ -252,6 +263,13 @@ pub fn cannot_be(path: &str, unit: &Unit, value: f64) -> String {
 }
 
 impl Live {
+    /// The parameters that an operator can set, in the order in which a panel shows them, with their ranges in SI.
+    pub fn settable(&self) -> impl Iterator<Item = (&Param, (f64, f64))> {
+        let all = if self.tuned.is_empty() { &self.params[..] } else { &[] };
+        let own = self.tuned.iter().filter_map(|tuned| Some((self.params.get(tuned.param)?, tuned.range)));
+        own.chain(all.iter().map(|param| (param, (f64::NEG_INFINITY, f64::INFINITY))))
+    }
+
     /// The parameter with this path.
     pub fn param(&self, path: &str) -> Option<&Param> {
         self.params.iter().find(|param| param.path == path)
@@ -277,13 +295,18 @@ impl Live {
         if let Some(slot) = self.places().map(|(_, slot)| slot).chain(slots).find(|slot| slot.index() >= judge) {
             return Some(format!("a condition names slot {} in a block of {judge} slots", slot.0));
         }
+        let range = |tuned: &Tuned| tuned.range.0 < tuned.range.1;
+        if let Some(tuned) = self.tuned.iter().find(|tuned| tuned.param >= self.params.len() || !range(tuned)) {
+            return Some(format!("`tune` has parameter {} from {} to {}", tuned.param, tuned.range.0, tuned.range.1));
+        }
         let outside = self.places().find(|(slot, _)| !params.contains(&slot.index()));
         outside.map(|(slot, _)| format!("slot {} of the control program is no parameter", slot.0))
     }
 }
 
 encode_structs! {
-    Live { params, checks }
+    Live { params, checks, tuned }
+    Tuned { param, range }
     Param { path, unit, boolean, place }
 }
 
@@ -399,6 +422,7 @@ mod tests {
                 Check::Multiple { period: Slot(7), step: 1e-3 },
                 Check::Carried { path: "panel.lamp".into(), unit, value: Slot(8), range: (0.0, 255.0) },
             ],
+            tuned: vec![Tuned { param: 0, range: (0.1, f64::INFINITY) }],
         }
     }
 
@@ -440,5 +464,13 @@ mod tests {
         assert_eq!(live().fault(3..6, 9), None);
         assert!(live().fault(3..6, 8).is_some_and(|why| why.contains("slot 8")));
         assert!(live().fault(3..4, 9).is_some_and(|why| why.contains("no parameter")));
+        for tuned in [
+            Tuned { param: 2, range: (0.0, 1.0) },
+            Tuned { param: 0, range: (1.0, 1.0) },
+            Tuned { param: 0, range: (f64::NAN, 1.0) },
+        ] {
+            let live = Live { tuned: vec![tuned], ..live() };
+            assert!(live.fault(3..6, 9).is_some_and(|why| why.contains("`tune` has parameter")), "{tuned:?}");
+        }
     }
 }

@@ -38,6 +38,8 @@ pub struct Rig {
     pub stops: Vec<Stop>,
     /// Quantities to record at every tick, besides inputs, outputs and states.
     pub record: Vec<Series>,
+    /// Curves that share a canvas of the panel, in the order of the text.
+    pub plots: Vec<Curves>,
     /// The drive (index into `nodes`) whose command is predicted for the instant at which it acts.
     pub predict: Option<usize>,
     /// Its contacts are only stable with prediction, so a rig that loses its shaft position must stop. This is
@@ -45,6 +47,15 @@ pub struct Rig {
     pub needs_look: bool,
     /// The part that hardware replaces, as a program.
     pub plant: Plant,
+}
+
+/// `plot a, b against c`: recorded quantities that are looked at together.
+#[derive(Clone, PartialEq, Eq, Debug)]
+pub struct Curves {
+    /// Indices into [`Rig::record`].
+    pub series: Vec<usize>,
+    /// Index of the quantity on the horizontal axis; `None`: time.
+    pub against: Option<usize>,
 }
 
 /// `overrun stop` or `overrun hold N`.

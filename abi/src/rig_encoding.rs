@@ -3,8 +3,8 @@
 use crate::encode::{Encode, Malformed, Reader};
 use crate::plan::{Method, Series};
 use crate::rig::{
-    Bus, Cia402, DriveLimits, Field, Format, Input, Kind, Message, Mode, Node, Output, Overrun, Plant, Rig, Signal,
-    SignalKind, Stop,
+    Bus, Cia402, Curves, DriveLimits, Field, Format, Input, Kind, Message, Mode, Node, Output, Overrun, Plant, Rig,
+    Signal, SignalKind, Stop,
 };
 use crate::{encode_enums, encode_structs};
 
@@ -16,9 +16,10 @@ encode_enums! {
 encode_structs! {
     Series { label, slot, unit, boolean }
     Rig {
-        name, period_ns, method, steps, buses, nodes, inputs, outputs, watchdog_ns, overrun, stops, record, predict,
-        needs_look, plant,
+        name, period_ns, method, steps, buses, nodes, inputs, outputs, watchdog_ns, overrun, stops, record, plots,
+        predict, needs_look, plant,
     }
+    Curves { series, against }
     Bus { name, address, bit_rate }
     Node { name, bus, kind, moves, delay, lag, timeout_ns, within }
     DriveLimits { max_speed, travel, max_power }
@@ -189,7 +190,8 @@ mod tests {
             watchdog_ns: 5_000_000,
             overrun: Overrun::Hold(3),
             stops: vec![Stop { slot: Slot(6), condition: "x > 1 m".into(), why: "too far".into() }],
-            record: vec![series],
+            record: vec![series.clone(), series],
+            plots: vec![Curves { series: vec![0, 1], against: None }, Curves { series: vec![0], against: Some(1) }],
             predict: Some(0),
             needs_look: true,
             plant: Plant {

@@ -388,7 +388,8 @@ fn cut_rig(
     };
     warnings.extend(diagnostics);
     let lowered = cut.lowered(warnings);
-    Ok((cut, lowered))
+    let untunable = cut.untunable(&lowered.live);
+    if untunable.is_empty() { Ok((cut, lowered)) } else { Err(untunable) }
 }
 
 /// Code of the previous case, and the program that it was made from.

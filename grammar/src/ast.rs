@@ -454,8 +454,28 @@ pub enum ExperimentStatement {
     Sweep(Sweep),
     Data(Data),
     Plot(Plot),
+    /// `tune fr.Fs in 1 N .. 2 N, fr.vs`
+    Tune(Vec<Tuned>, Span),
     Expect(Expect),
     Allow(Allow),
+}
+
+/// `fr.Fs in 1 N .. 2 N`: a parameter that may be turned, and how far.
+#[derive(Clone, PartialEq, Debug)]
+#[allow(missing_docs)]
+pub struct Tuned {
+    pub path: Path,
+    pub range: Option<(Expr, Expr)>,
+    pub span: Span,
+}
+
+/// `plot body.x [deg], r [deg] against t [s]` of a rig.
+#[derive(Clone, PartialEq, Debug)]
+#[allow(missing_docs)]
+pub struct Curves {
+    pub shows: Vec<Show>,
+    pub against: Option<Show>,
+    pub span: Span,
 }
 
 /// `run Servo(r = 1 m) for 100 s`
@@ -708,6 +728,8 @@ pub enum RigStatement {
         span: Span,
     },
     Record(Vec<Show>, Span),
+    Plot(Curves),
+    Tune(Vec<Tuned>, Span),
     Allow(Allow),
 }
 

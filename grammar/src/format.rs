@@ -505,8 +505,9 @@ impl<'s, 't> Layout<'s, 't> {
                     let signal = matches!(self.source.word(start), "send" | "read");
                     let wire = self.kind(line).0 == "equation";
                     let fits = match word {
-                        // A `vary` lists several parameters, each with its range; so does a `plot` its curves.
-                        "in" => !matches!(self.source.word(start), "plot" | "vary"),
+                        // A `vary` and a `tune` list several parameters, each with its range; so does a `plot` its
+                        // curves.
+                        "in" => !matches!(self.source.word(start), "plot" | "tune" | "vary"),
                         "limit" | "slew" => wire,
                         _ => signal,
                     };

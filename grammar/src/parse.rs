@@ -800,6 +800,7 @@ impl<'t> Reader<'t> {
                     let title = children.maybe(Rule::string).map(|title| self.string(title));
                     ExperimentStatement::Plot(Plot { curves, against, after, before, title, span })
                 }
+                Rule::tune => ExperimentStatement::Tune(self.tuned(&mut children), span),
                 Rule::expect => ExperimentStatement::Expect(self.expect(pair)),
                 Rule::shown => {
                     let show = self.shows(&mut children).remove(0);
@@ -929,6 +930,13 @@ impl<'t> Reader<'t> {
                 RigStatement::Stop { condition, why: self.string(children.one()), span }
             }
             Rule::record => RigStatement::Record(self.shows(&mut children), span),
+            Rule::curves => {
+                let last = says(&pair, Rule::kw_against);
+                let mut shows = self.shows(&mut children);
+                let against = if last { shows.pop() } else { None };
+                RigStatement::Plot(Curves { shows, against, span })
+            }
+            Rule::tune => RigStatement::Tune(self.tuned(&mut children), span),
             Rule::allow => RigStatement::Allow(self.allow(pair)),
             rule => unreachable!("{rule:?} is no statement of a rig"),
         })
@@ -946,6 +954,17 @@ impl<'t> Reader<'t> {
 
     fn name(&self, pair: Pair<Rule>) -> Name {
         Name { text: pair.as_str().to_string(), span: self.span(&pair) }
+    }
+
+    fn tuned(&mut self, children: &mut Children<'t>) -> Vec<Tuned> {
+        let one = |item: Pair<'t, Rule>| {
+            let (span, limited) = (self.span(&item), says(&item, Rule::dots));
+            let mut children = Children::of(item);
+            let path = self.path(children.one());
+            let range = limited.then(|| (self.value(&mut children), self.value(&mut children)));
+            Tuned { path, range, span }
+        };
+        children.all(Rule::tuned).into_iter().map(one).collect()
     }
 
     fn string(&self, pair: Pair<Rule>) -> Text {

@@ -86,12 +86,12 @@ impl Place {
     /// Words that begin a statement in this block and are allowed as names elsewhere.
     fn starters(self) -> &'static [&'static str] {
         match self {
-            Place::Experiment => &["run", "solver", "sweep", "data", "plot", "expect", "show"],
-            Place::Fit => &["run", "solver", "sweep", "data", "plot", "expect", "show", "vary", "minimise"],
+            Place::Experiment => &["run", "solver", "sweep", "data", "plot", "tune", "expect", "show"],
+            Place::Fit => &["run", "solver", "sweep", "data", "plot", "tune", "expect", "show", "vary", "minimise"],
             Place::Device => &["send", "read"],
             Place::Rig => &[
                 "run", "rate", "solver", "bus", "drive", "hardware", "watchdog", "overrun", "predict", "safe", "stop",
-                "record",
+                "record", "plot", "tune",
             ],
             Place::Interface | Place::Model | Place::Every | Place::Mode | Place::Resets | Place::Hardware => &[],
         }

@@ -17,6 +17,8 @@ pub struct Knob {
     doc: Option<String>,
     boolean: bool,
     range: (f64, f64),
+    /// How far `tune` lets it be set, SI.
+    limit: (f64, f64),
     /// The value of the text, SI.
     pub own: f64,
 }
@@ -50,7 +52,14 @@ impl Knob {
     /// Of a parameter with its value in the text.
     pub fn new(quantity: &Quantity, own: f64) -> Knob {
         let Quantity { path, unit, doc, boolean, range, .. } = quantity;
-        Knob { path: path.clone(), unit: unit.clone(), doc: doc.clone(), boolean: *boolean, range: *range, own }
+        let limit = (f64::NEG_INFINITY, f64::INFINITY);
+        Knob { path: path.clone(), unit: unit.clone(), doc: doc.clone(), boolean: *boolean, range: *range, limit, own }
+    }
+
+    /// With the limits of `tune`, SI.
+    pub fn tuned(self, limit: (f64, f64)) -> Knob {
+        let range = (self.range.0.max(limit.0), self.range.1.min(limit.1));
+        Knob { range, limit, ..self }
     }
 
     /// What the page needs to know of it; numbers in its unit.
@@ -96,6 +105,11 @@ impl Knob {
         }
         let (si, unit) = quantity::parse(text).map_err(|why| clean(&why))?;
         if unit.dimension == self.unit.dimension || si == 0.0 && unit.text.is_empty() {
+            let (low, high) = self.limit;
+            if si < low || si > high {
+                let [low, high, si] = [low, high, si].map(|si| self.text(si));
+                return Err(format!("E0502: `{}` is tuned from {low} to {high}, not to {si}", self.path));
+            }
             return Ok(si);
         }
         let (wanted, found) = (self.unit.dimension.describe(), unit.dimension.describe());
@@ -164,6 +178,11 @@ mod tests {
             [knob("fr.Fs", "N·m", 0.42, (0.0, 1.0)), knob("Ti", "s", 0.2, (0.0, 9.0)), knob("on", "", 1.0, (0.0, 1.0))];
         assert_eq!(set("fr.Fs = 310 mN·m", &all), Ok(vec![(0, 0.31)]));
         assert_eq!(set("Ti=20 ms , fr.Fs = 0, on = false", &all), Ok(vec![(1, 0.02), (0, 0.0), (2, 0.0)]));
+        let tuned = [knob("Ti", "s", 0.2, (0.0, 9.0)).tuned((0.1, 0.5))];
+        assert_eq!(set("Ti = 500 ms", &tuned), Ok(vec![(0, 0.5)]));
+        assert_eq!(ends(0.2, tuned[0].range), Ends { from: 0.1, to: 0.5, logarithmic: false });
+        let refused = set("Ti = 0.6 s", &tuned).unwrap_err();
+        assert_eq!(refused, "E0502: `Ti` is tuned from 0.1 s to 0.5 s, not to 0.6 s");
         let endless = [knob("vd", "m/s", f64::INFINITY, (0.0, f64::INFINITY))];
         assert_eq!(set("vd = inf", &endless), Ok(vec![(0, f64::INFINITY)]));
         assert_eq!(set("vd = 3 mm/s", &endless), Ok(vec![(0, 0.003)]));

@@ -85,10 +85,10 @@ impl Operated {
     /// Its log has begun. `control`: the program whose parameters change.
     pub fn begins(&self, played: Arc<Played>, live: &Live, control: &Instance) {
         let quantities = &control.description().quantities;
-        let knobs = live.params.iter().filter_map(|param| {
+        let knobs = live.settable().filter_map(|(param, limit)| {
             let Tunable::Live(slot, _) = param.place else { return None };
             let quantity = quantities.iter().find(|quantity| quantity.path == param.path && quantity.slot == slot)?;
-            Some(Turned { knob: Knob::new(quantity, control.block()[slot.index()]), slot })
+            Some(Turned { knob: Knob::new(quantity, control.block()[slot.index()]).tuned(limit), slot })
         });
         let begun = Begun { played, knobs: knobs.collect() };
         let _ = self.begun.set(begun);

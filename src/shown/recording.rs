@@ -108,7 +108,15 @@ impl Recording {
         // Readings and commands keep their numbers also where a recorded quantity has the same name.
         let begin = sheet.signals.len();
         sheet.signals.extend(all);
-        sheet.place(&recorded, None);
+        let mut plotted = BTreeSet::new();
+        for plot in &rig.plots {
+            let series: Vec<usize> = plot.series.iter().map(|at| recorded[*at]).collect();
+            let against = plot.against.map(|at| recorded[at]);
+            plotted.extend(series.iter().copied().chain(against));
+            sheet.place(&series, against);
+        }
+        let others: Vec<usize> = recorded.iter().copied().filter(|signal| !plotted.contains(signal)).collect();
+        sheet.place(&others, None);
         sheet.place(&(begin..begin + readings).collect::<Vec<_>>(), None);
         sheet.place(&(begin + readings..sheet.signals.len()).collect::<Vec<_>>(), None);
         let count = sheet.signals.len();

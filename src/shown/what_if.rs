@@ -6,7 +6,7 @@
 
 use super::knob::{self, Knob};
 use super::sheet::Sheet;
-use crate::compile::{self, Loaded, Options, Stopwatch, Varying};
+use crate::compile::{self, Loaded, Options, Stopwatch, Tuned, Varying};
 use crate::{project, report, results};
 use abi::Slot;
 use abi::format::{count, duration};
@@ -69,6 +69,21 @@ impl Setup {
             }
         }
         knobs.retain(|knob| !swept.contains(&knob.path));
+        // The cases of an experiment have the same `tune`, each for the parameters that it has.
+        let mut tuned: Vec<&Tuned> = Vec::new();
+        for one in cases.iter().flat_map(|case| &case.tuned) {
+            if tuned.iter().all(|other| other.path != one.path) {
+                tuned.push(one);
+            }
+        }
+        if !tuned.is_empty() {
+            tuned.sort_by_key(|one| one.span.start);
+            let knob = |one: &&Tuned| {
+                let at = knobs.iter().position(|knob| knob.path == one.path)?;
+                Some(knobs[at].clone().tuned(one.range))
+            };
+            knobs = tuned.iter().filter_map(knob).collect();
+        }
         let slot = |case: &Varying, knob: &Knob| case.params().find(|(q, _)| q.path == knob.path).map(|(q, _)| q.slot);
         let slots = cases.iter().map(|case| knobs.iter().map(|knob| slot(case, knob)).collect()).collect();
         let first = cases.first().expect("an experiment has a case");

@@ -378,6 +378,7 @@ impl Found {
                         ExperimentStatement::Solver(_)
                         | ExperimentStatement::Data(_)
                         | ExperimentStatement::Plot(_)
+                        | ExperimentStatement::Tune(..)
                         | ExperimentStatement::Expect(_)
                         | ExperimentStatement::Allow(_) => {}
                     }

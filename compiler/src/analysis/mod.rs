@@ -4,6 +4,7 @@
 //! Changes none of its inputs.
 
 pub mod parameter_checks;
+pub mod tuning;
 pub mod domains;
 pub mod memo;
 pub mod interval_proof;

@@ -14,7 +14,7 @@ pub mod vary;
 
 pub use command_line::{ChangeOf, Overrides, overrides};
 pub use expectations::is_number_of_peak;
-pub use sweeps::{quantity, spaced};
+pub use sweeps::spaced;
 
 use command_line::{CommandLine, also};
 use expectations::ExpectAt;
@@ -24,6 +24,7 @@ use sweeps::{combinations, grids, label, meets, same_path, unmatched_cases};
 
 use crate::analysis::linearise::{OpenPorts, PortSlots, Ports, open};
 use crate::analysis::parameter_checks;
+use crate::analysis::tuning::{self, Tuned};
 use crate::frontend::delays;
 use crate::frontend::flatten::{Instance, Override, OverrideValue, Request, flatten};
 use crate::frontend::resolve::Loaded;
@@ -116,6 +117,8 @@ pub struct Variant {
     pub begins: f64,
     /// Of a fit: its recording has no times; each row is a steady point.
     pub steady: bool,
+    /// Parameters that its panel may turn, in this order; all if there are none.
+    pub tuned: Vec<Tuned>,
 }
 
 /// A rig that an experiment runs against its own plant.
@@ -146,6 +149,7 @@ struct Statements<'a> {
     sweeps: Vec<&'a ast::Sweep>,
     data: Option<&'a ast::Data>,
     plots: Vec<&'a ast::Plot>,
+    tunes: Vec<&'a ast::Tuned>,
     expects: Vec<&'a ast::Expect>,
     /// `allow discretisation`
     stepped: bool,
@@ -310,7 +314,15 @@ pub fn read(
             Err(errors) => return Err(errors),
         }
     }
-    Ok(variants)
+    // The cases of a sweep over models differ in their parameters.
+    let nowhere = |item: &&&ast::Tuned| {
+        let path = tuning::path(item, &loaded.files);
+        !variants.iter().any(|variant| tuning::has(&variant.system, &path))
+    };
+    let unknown = parts.tunes.iter().filter(nowhere);
+    let unknown: Vec<Diagnostic> =
+        unknown.map(|item| tuning::unknown(item, &variants[0].system, &loaded.files)).collect();
+    if unknown.is_empty() { Ok(variants) } else { Err(unknown) }
 }
 
 fn parts<'a>(
@@ -320,7 +332,7 @@ fn parts<'a>(
 ) -> Option<Statements<'a>> {
     let mut run: Option<&ast::Run> = None;
     let mut parts = (None, Vec::new(), None, Vec::new(), Vec::new());
-    let (mut stepped, mut allowed) = (false, Vec::new());
+    let (mut stepped, mut allowed, mut tunes) = (false, Vec::new(), Vec::new());
     let mut unknown = Vec::new();
     let mut twice = |what: &str, span: Span, first: Span| {
         let error = Diagnostic::error("E0301", format!("an experiment has one `{what}`"))
@@ -344,6 +356,7 @@ fn parts<'a>(
                 None => parts.2 = Some(one),
             },
             ExperimentStatement::Plot(one) => parts.3.push(one),
+            ExperimentStatement::Tune(all, _) => tunes.extend(all),
             ExperimentStatement::Expect(one) => parts.4.push(one),
             ExperimentStatement::Allow(allow) => {
                 let own = matches!(allow.lint.text.as_str(), "discretisation" | "recording-ends");
@@ -364,7 +377,7 @@ fn parts<'a>(
         return None;
     };
     let (solver, sweeps, data, plots, expects) = parts;
-    Some(Statements { span: experiment.span, run, solver, sweeps, data, plots, expects, stepped, allowed })
+    Some(Statements { span: experiment.span, run, solver, sweeps, data, plots, tunes, expects, stepped, allowed })
 }
 
 #[allow(clippy::too_many_arguments)]
@@ -511,6 +524,7 @@ fn variant<'a>(
         }
     }
     reader.recording_ends(parts, data, duration, warnings);
+    let tuned = tuning::read(&parts.tunes, &system, &types, &loaded.files, &mut reader.diagnostics);
     let mut expects_at = Vec::new();
     for (k, (expect, at)) in parts.expects.iter().zip(&expects).enumerate() {
         reader.expect = k;
@@ -615,7 +629,7 @@ fn variant<'a>(
     let outputs = ports.outputs.iter().zip(ports_at).map(|((path, _), at)| (path.clone(), slots[at]));
     let ports = (inputs.collect(), outputs.collect());
     let (rows, begins, steady) = (Vec::new(), 0.0, false);
-    Ok(Variant { label, system, types, program, adaptive, experiment, places, ports, rig, rows, begins, steady })
+    Ok(Variant { label, system, types, program, adaptive, experiment, places, ports, rig, rows, begins, steady, tuned })
 }
 
 /// The rig that an experiment runs, with its descriptions; `None` if it runs a model.

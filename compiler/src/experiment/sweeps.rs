@@ -4,9 +4,9 @@ use super::command_line::CommandLine;
 use super::{Change, MOST_VARIANTS, Statements, one_line};
 use crate::codegen::elementary::ElementaryFunction;
 use crate::frontend::flatten::OverrideValue;
+use crate::frontend::literals::quantity;
 use crate::frontend::resolve::Loaded;
 use crate::ir::Binary;
-use abi::unit::Unit;
 use grammar::ast::{self, Expr, Spacing, SweepOver};
 use grammar::diagnostic::Diagnostic;
 use grammar::span::Span;
@@ -96,19 +96,6 @@ pub fn spaced(count: usize, a: f64, b: f64, log: bool) -> Vec<f64> {
 /// A number rounded to twelve digits, which removes the rounding errors of `a + k·h`.
 fn rounded(x: f64) -> f64 {
     format!("{x:.11e}").parse().unwrap_or(x)
-}
-
-/// A literal in SI units, its unit and the unit as written.
-pub fn quantity(expr: &Expr) -> Option<(f64, Unit, Option<ast::UnitText>)> {
-    match &expr.kind {
-        ast::ExprKind::Number { value, unit: None } => Some((*value, Unit::none(), None)),
-        ast::ExprKind::Number { value, unit: Some(text) } => {
-            let unit = Unit::parse(&text.text).ok()?;
-            Some((unit.to_si(*value), unit, Some(text.clone())))
-        }
-        ast::ExprKind::Unary(ast::UnaryOp::Negate, a) => quantity(a).map(|(value, unit, text)| (-value, unit, text)),
-        _ => None,
-    }
 }
 
 /// All combinations of the sweeps, the last sweep varying fastest, each with the text of its value.

@@ -4,6 +4,7 @@
 //! plan, or the condition that the values violate. Everything in a plan that depends on parameters is recomputed:
 //! duration, windows, corners, declared ranges and `require` conditions. Only code is compiled once.
 
+use crate::analysis::tuning::Tuned;
 use crate::experiment::start_values;
 use crate::experiment::{PlanNumber, Variant, depends, is_number_of_peak};
 use crate::frontend::source::Files;
@@ -30,6 +31,8 @@ pub struct Varying {
     pub experiment: Experiment,
     /// The plots of the experiment.
     pub plots: Vec<Plot>,
+    /// Parameters that its panel may turn, in this order; all if there are none.
+    pub tuned: Vec<Tuned>,
     /// Notes for the user.
     pub notes: Vec<String>,
     description: Arc<Description>,
@@ -95,7 +98,7 @@ impl Varying {
     /// From an experiment as read, and its code.
     pub fn new(variant: Variant, vary: &[String], files: &Files, runnable: Runnable) -> Varying {
         let Runnable { code, slice, lanes, adaptive, notes } = runnable;
-        let Variant { label, system, types, program, mut experiment, places, .. } = variant;
+        let Variant { label, system, types, program, mut experiment, places, tuned, .. } = variant;
         let varies = |expr: ExprId| depends(&system, expr, &|var| vary.contains(&var.path));
         let (mut exprs, mut uses) = (Vec::new(), Vec::new());
         for (place, expr) in places {
@@ -166,6 +169,7 @@ impl Varying {
             label,
             experiment,
             plots,
+            tuned,
             notes,
             description: Arc::new(program.description),
             params: program.params,

@@ -10,7 +10,8 @@ pub use unknown::Unknown;
 use crate::experiment::of_fit::{self, compared, reads_recording, sides};
 use crate::experiment::vary::{Varying, param_of};
 use crate::experiment::{self, Changes, Variant};
-use crate::fit::unknown::{number, typical, unknown};
+use crate::fit::unknown::{typical, unknown};
+use crate::frontend::literals::number;
 use crate::frontend::resolve::Loaded;
 use crate::frontend::source::Sources;
 use abi::Slot;
@@ -182,6 +183,7 @@ fn parts(fit: &ast::Fit) -> Result<Parts<'_>, Vec<Diagnostic>> {
             FitStatement::Experiment(
                 ExperimentStatement::Solver(_)
                 | ExperimentStatement::Plot(_)
+                | ExperimentStatement::Tune(..)
                 | ExperimentStatement::Expect(_)
                 | ExperimentStatement::Allow(_),
             ) => {}

@@ -2,13 +2,14 @@
 //!
 //! In: an item of `vary`, and the program with its parameters. Out: an [`Unknown`], or what is wrong.
 
+use crate::experiment::Variant;
 use crate::experiment::vary::param_of;
-use crate::experiment::{Variant, quantity};
+use crate::frontend::literals::{number, quantity};
 use crate::frontend::names::nearest;
 use abi::description::{Kind, Quantity};
-use abi::unit::{Dimension, Unit};
+use abi::unit::Unit;
 use abi::{Description, Slot};
-use grammar::ast::{self, Expr};
+use grammar::ast;
 use grammar::diagnostic::Diagnostic;
 use grammar::span::Span;
 
@@ -149,22 +150,4 @@ fn middle(low: f64, high: f64) -> f64 {
     let middle = if low * high > 0.0 { (low * high).sqrt().copysign(low) } else { 0.5 * (low + high) };
     // A range that is written backwards is reported elsewhere.
     middle.max(low.min(high)).min(low.max(high))
-}
-
-/// A number with a unit of this dimension, in SI.
-pub fn number(expr: &Expr, dimension: Dimension, diagnostics: &mut Vec<Diagnostic>) -> Option<f64> {
-    let Some((value, unit, text)) = quantity(expr) else {
-        let error = Diagnostic::error("E0904", "a number with its unit stands here").label(expr.span, "not a number");
-        diagnostics.push(error.help("write it as a number, such as `1.5 N`"));
-        return None;
-    };
-    // 0 fits every unit.
-    if unit.dimension != dimension && !(value == 0.0 && text.is_none()) {
-        let (wanted, is) = (dimension.describe(), unit.dimension.describe());
-        let error = Diagnostic::error("E0101", format!("{wanted} stands here, not {is}")).label(expr.span, is);
-        let si = Unit::si(dimension);
-        diagnostics.push(error.help(format!("write it in {}", if si.text.is_empty() { "no unit" } else { &si.text })));
-        return None;
-    }
-    Some(value)
 }

@@ -4,6 +4,7 @@
 //! expression, and diagnostics. Knows nothing of programs, except for constants and the buffers of delays.
 
 pub mod names;
+pub mod literals;
 pub mod source;
 pub mod resolve;
 pub mod system;

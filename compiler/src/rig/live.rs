@@ -235,7 +235,7 @@ impl LiveChecks {
             boolean: known.boolean,
             place: place(known),
         });
-        let live = Live { params: params.collect(), checks: self.checks.clone() };
+        let live = Live { params: params.collect(), checks: self.checks.clone(), tuned: Vec::new() };
         (live, self.program)
     }
 }

@@ -18,6 +18,7 @@ mod step_derivative;
 mod wires;
 
 use crate::analysis::parameter_checks;
+use crate::analysis::tuning::{self, Tuned};
 use crate::frontend::flatten::{self, BusNode, Frame, Instance, Override, RigFrame, Scope, flatten};
 use crate::frontend::resolve::{ItemRef, Loaded, Lookup, Space};
 use crate::frontend::source::{Files, Sources, Tree};
@@ -146,6 +147,7 @@ pub struct PartitionedRig {
     seen: Vec<VarId>,
     seen_read: Vec<ExprId>,
     judged: live::LiveChecks,
+    tuned: Vec<Tuned>,
     /// Spans for messages about the rig.
     pub places: RigSpans,
 }
@@ -257,7 +259,7 @@ fn within(outer: Span, inner: Span) -> bool {
 
 /// Indices of the rig's expressions among all expressions of the frame.
 #[derive(Default)]
-struct ExprIndices {
+struct ExprIndices<'a> {
     rate: usize,
     step: Option<usize>,
     watchdog: Option<usize>,
@@ -269,7 +271,8 @@ struct ExprIndices {
     /// Outputs of the part: the wire in `hardware`, and its value.
     gives: Vec<(usize, usize)>,
     stops: Vec<usize>,
-    records: Vec<usize>,
+    /// What is recorded, then what is plotted.
+    records: Vec<(&'a ast::Show, usize)>,
 }
 
 /// `drive.signal = expr limit a .. b slew r`
@@ -357,7 +360,7 @@ impl<'a> RigReader<'a, '_> {
     }
 
     /// Collects all expressions that are read in the scope of the rig.
-    fn lists(&mut self) -> ExprIndices {
+    fn lists(&mut self) -> ExprIndices<'a> {
         let mut lists = ExprIndices::default();
         let seconds = unit("s");
         if let Some((expr, span)) = self.statements.rate {
@@ -406,13 +409,14 @@ impl<'a> RigReader<'a, '_> {
         for (condition, ..) in &self.statements.stops {
             lists.stops.push(self.expressions.read(Scope::Condition, condition));
         }
-        for show in &self.statements.records {
-            lists.records.push(self.expressions.read(Scope::Rig, &show.value));
+        let plotted = self.statements.plots.iter().flat_map(|plot| plot.shows.iter().chain(&plot.against));
+        for show in self.statements.records.iter().copied().chain(plotted) {
+            lists.records.push((show, self.expressions.read(Scope::Rig, &show.value)));
         }
         lists
     }
 
-    fn send(&mut self, wire: &'a ast::Wire, inside: bool, lists: &mut ExprIndices) {
+    fn send(&mut self, wire: &'a ast::Wire, inside: bool, lists: &mut ExprIndices<'a>) {
         let scope = if inside { Scope::Part } else { Scope::Rig };
         let [node, signal] = wire.path.segments.as_slice() else {
             let error = Diagnostic::error("E0204", "a command goes to a signal of a drive or device")
@@ -464,7 +468,7 @@ impl<'a> RigReader<'a, '_> {
         lists.sends.push(OutputCommand { node: at, read, unit, inside, value, limit, slew, safe: None, path, span });
     }
 
-    fn safe(&mut self, lists: &mut ExprIndices) {
+    fn safe(&mut self, lists: &mut ExprIndices<'a>) {
         for (path, value) in &self.statements.safe {
             let text = self.files.slice(path.span);
             let found = match path.segments.as_slice() {
@@ -596,7 +600,7 @@ impl<'a> RigReader<'a, '_> {
         }
         control.events.retain(|event| !inside[event.instance.0 as usize]);
         control.storages.retain(|(instance, _)| !inside[instance.0 as usize]);
-        let records: Vec<ExprId> = lists.records.iter().map(|record| at(*record)).collect();
+        let records: Vec<ExprId> = lists.records.iter().map(|(_, record)| at(*record)).collect();
         let own = |id: &VarId| {
             let var = system.var(*id);
             let framing = var.instance == framed.rig || framed.nodes.contains(&var.instance);
@@ -691,6 +695,11 @@ impl<'a> RigReader<'a, '_> {
                 commands: &fielded,
             },
         );
+        let tunes = &self.statements.tunes;
+        for item in tunes.iter().filter(|item| !tuning::has(&system, &tuning::path(item, self.files))) {
+            self.diagnostics.push(tuning::unknown(item, &system, self.files));
+        }
+        let tuned = tuning::read(tunes, &system, &types, self.files, self.diagnostics);
         let places = RigSpans {
             name: self.rig.name.span,
             rate: self.statements.rate.map_or(self.rig.name.span, |(expr, _)| expr.span),
@@ -721,10 +730,11 @@ impl<'a> RigReader<'a, '_> {
             seen: plant.seen,
             seen_read: plant.seen_read,
             judged,
+            tuned,
             places,
         };
         self.signals(&mut cut, &system, &framed, &gives, &at);
-        self.shows(&mut cut);
+        self.shows(&mut cut, &lists);
         if self.errors() > before {
             return None;
         }

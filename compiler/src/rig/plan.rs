@@ -8,6 +8,7 @@ use super::*;
 use crate::analysis::step_stability_report::{self, StepBy};
 use crate::ir::program::Program;
 use crate::lower::{self, lower};
+use abi::live::Tunable;
 use frames::{MessageLayout, OnBus};
 
 impl RigReader<'_, '_> {
@@ -109,6 +110,7 @@ impl RigReader<'_, '_> {
             overrun,
             stops: stops.collect(),
             record: Vec::new(),
+            plots: Vec::new(),
             predict,
             needs_look: false,
             plant: rig::Plant { applied: Vec::new(), seen: Vec::new(), inertia: None },
@@ -504,8 +506,11 @@ impl RigReader<'_, '_> {
     }
 
     /// Recorded quantities, each in its unit.
-    pub(super) fn shows(&mut self, cut: &mut PartitionedRig) {
-        for (show, expr) in self.statements.records.iter().zip(cut.records.clone()) {
+    pub(super) fn shows(&mut self, cut: &mut PartitionedRig, lists: &ExprIndices) {
+        let exprs = std::mem::take(&mut cut.records);
+        // A quantity that is plotted is recorded once, whether `record` names it or not.
+        let mut places = Vec::new();
+        for ((show, _), expr) in lists.records.iter().zip(exprs) {
             let boolean = cut.control_types.boolean[expr.0 as usize];
             let dimension = cut.control_types.nodes[expr.0 as usize].unwrap_or(Dimension::NONE);
             let own = match cut.control.node(expr) {
@@ -532,7 +537,20 @@ impl RigReader<'_, '_> {
                 },
             };
             let label = one_line(self.files.slice(show.value.span));
-            cut.rig.record.push(Series { label, slot: Slot(0), unit: shown, boolean });
+            let series = Series { label, slot: Slot(0), unit: shown, boolean };
+            let known = cut.rig.record.iter().position(|other| *other == series);
+            let known = known.filter(|_| places.len() >= self.statements.records.len());
+            places.push(known.unwrap_or(cut.rig.record.len()));
+            if known.is_none() {
+                cut.rig.record.push(series);
+                cut.records.push(expr);
+            }
+        }
+        let mut plotted = places.into_iter().skip(self.statements.records.len());
+        for plot in &self.statements.plots {
+            let series = plotted.by_ref().take(plot.shows.len()).collect();
+            let against = plot.against.as_ref().and_then(|_| plotted.next());
+            cut.rig.plots.push(rig::Curves { series, against });
         }
     }
 }
@@ -584,8 +602,23 @@ impl PartitionedRig {
         control.size_rings(period / f64::from(rig.steps));
         plant.size_rings(period / f64::from(super::PLANT_STEPS));
         warnings.extend(self.advice(&rig, &control, &plant));
-        let (live, judge) = self.judged.clone().finish(&control, &plant);
+        let (mut live, judge) = self.judged.clone().finish(&control, &plant);
+        for Tuned { path, range, .. } in &self.tuned {
+            let param = live.params.iter().position(|param| param.path == *path);
+            live.tuned.extend(param.map(|param| words::Tuned { param, range: *range }));
+        }
         super::Lowered { rig, control, plant, live, judge }
+    }
+
+    /// E0504: parameters that `tune` names although only a start reads them.
+    pub fn untunable(&self, live: &Live) -> Vec<Diagnostic> {
+        let one = |Tuned { path, span, .. }: &Tuned| {
+            let Tunable::Start(why) = &live.param(path)?.place else { return None };
+            let error = Diagnostic::error("E0504", format!("`{path}` cannot be tuned while the rig runs"));
+            let error = error.label(*span, format!("only a start reads it: {why}"));
+            Some(error.help(format!("leave it out, and set it at a start with `--set {path}=…`")))
+        };
+        self.tuned.iter().filter_map(one).collect()
     }
 
     /// Warnings about the rig, except those that it allows.

@@ -25,6 +25,8 @@ pub struct Statements<'a> {
     pub safe: Vec<(&'a ast::Path, &'a Expr)>,
     pub stops: Vec<(&'a Expr, &'a str, Span)>,
     pub records: Vec<&'a ast::Show>,
+    pub plots: Vec<&'a ast::Curves>,
+    pub tunes: Vec<&'a ast::Tuned>,
     pub allows: Vec<&'a ast::Allow>,
 }
 
@@ -63,6 +65,8 @@ impl<'a> Statements<'a> {
                 RigStatement::Safe(values, _) => out.safe.extend(values.iter().map(|(path, value)| (path, value))),
                 RigStatement::Stop { condition, why, span } => out.stops.push((condition, &why.text, *span)),
                 RigStatement::Record(shows, _) => out.records.extend(shows),
+                RigStatement::Plot(curves) => out.plots.push(curves),
+                RigStatement::Tune(all, _) => out.tunes.extend(all),
                 RigStatement::Allow(allow) => out.allows.push(allow),
                 RigStatement::Run(_)
                 | RigStatement::Rate(..)

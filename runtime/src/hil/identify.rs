@@ -116,8 +116,8 @@ impl Identification {
         let pulses = Pulses { layout, heights, pulse, each };
         let program = Instance::new(Arc::new(description), Code::Interpreted(Arc::new(pulses)), &[]);
         let duration_ns = each * drives.len() as u64 * rig.period_ns;
-        let (inputs, stops, record, predict) = (Vec::new(), Vec::new(), Vec::new(), None);
-        let rig = Rig { outputs, inputs, stops, record, predict, steps: 1, ..rig.clone() };
+        let (inputs, stops, record, plots, predict) = (Vec::new(), Vec::new(), Vec::new(), Vec::new(), None);
+        let rig = Rig { outputs, inputs, stops, record, plots, predict, steps: 1, ..rig.clone() };
         Ok(Identification { rig, program, duration_ns, drives })
     }
 

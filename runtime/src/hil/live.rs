@@ -8,9 +8,9 @@
 
 use crate::safety::{Protection, is_present};
 use abi::description::Guard;
-use abi::format::three_digits;
+use abi::format::{quantity, three_digits};
 use abi::live::{Live, NUMBERS, Tunable};
-use abi::unit::{NoQuantity, Unit, quantity};
+use abi::unit::{self, NoQuantity, Unit};
 use abi::{Function, Instance, Slot};
 use std::sync::Arc;
 
@@ -193,6 +193,7 @@ impl Judge {
                     return Err(format!("only a start reads `{path}`: {why}; start with `--set {path}={value}`"));
                 }
             };
+            let range = self.range(path)?;
             if values.iter().any(|(other, _)| *other == slot) {
                 return Err(format!("`{path}` stands twice in this set"));
             }
@@ -202,10 +203,28 @@ impl Judge {
                 (true, _) => return Err(format!("E0101: `{path}` is true or false, not `{value}`")),
                 (false, _) => in_unit(path, &param.unit, value)?,
             };
+            if si < range.0 || si > range.1 {
+                let shown = |si: f64| quantity(si, &param.unit, 3);
+                return Err(format!(
+                    "E0502: the rig lets `{path}` be set from {} to {} (`tune`), not to {}",
+                    shown(range.0),
+                    shown(range.1),
+                    shown(si)
+                ));
+            }
             values.push((slot, si));
         }
         Set::new(&values)
             .ok_or_else(|| format!("at most {SET_MOST} parameters change at once, and these are {}", values.len()))
+    }
+
+    /// How far a parameter may be set, SI; a message if `tune` names others only.
+    fn range(&self, path: &str) -> Result<(f64, f64), String> {
+        if let Some((_, range)) = self.live.settable().find(|(param, _)| param.path == path) {
+            return Ok(range);
+        }
+        let names: Vec<&str> = self.live.settable().map(|(param, _)| param.path.as_str()).collect();
+        Err(format!("the rig does not let `{path}` be set: its `tune` names {}", names.join(", ")))
     }
 
     fn unknown(&self, path: &str) -> String {
@@ -219,7 +238,7 @@ impl Judge {
 
 /// Converts a number with a unit to SI, for a parameter with another unit of the same dimension.
 fn in_unit(path: &str, unit: &Unit, text: &str) -> Result<f64, String> {
-    let (number, given) = quantity(text).map_err(|why| match why {
+    let (number, given) = unit::quantity(text).map_err(|why| match why {
         NoQuantity::Number(_) => format!("`{path}` is set to a number with its unit: {why}"),
         NoQuantity::Unit(_) => format!("E0102: {why}"),
     })?;
@@ -247,4 +266,45 @@ fn distance(a: &str, b: &str) -> usize {
         }
     }
     row[b.len()]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::rng::Chance;
+    use crate::testing::rigs;
+    use abi::live::Tuned;
+
+    /// Random `tune`s and random sets, judged by what they were made of.
+    #[test]
+    fn tune_lets_exactly_its_parameters_be_set_within_their_ranges() {
+        let (_, model, _) = rigs::pair();
+        let judge = rigs::judge(&model);
+        let (mut taken, mut refused) = (0, 0);
+        for seed in 1..=4000 {
+            let mut chance = Chance(seed);
+            let mut hundredth = |below: u64| chance.below(below) as f64 / 100.0;
+            let mut tuned = Vec::new();
+            for param in 0..3 {
+                let (low, width, which) = (hundredth(50), 0.01 + hundredth(50), hundredth(4));
+                let range = if which < 0.015 { (f64::NEG_INFINITY, f64::INFINITY) } else { (low, low + width) };
+                if which > 0.005 {
+                    tuned.push(Tuned { param, range });
+                }
+            }
+            let (at, value) = (chance.below(3) as usize, 0.005 + chance.below(120) as f64 / 100.0);
+            let live = Live { tuned: tuned.clone(), ..(*judge.live).clone() };
+            let judge = Judge { live: Arc::new(live), ..judge.clone() };
+            let (path, unit) = [("T", "N·m"), ("d", "N·m·s/rad"), ("end", "s")][at];
+            let found = judge.read(&format!("{path} = {value} {unit}"));
+            let own = tuned.iter().find(|tuned| tuned.param == at);
+            let allowed = tuned.is_empty() || own.is_some_and(|own| (own.range.0..=own.range.1).contains(&value));
+            match &found {
+                Ok(set) => assert!(allowed && set.values().len() == 1, "seed {seed}: {path} = {value} by {tuned:?}"),
+                Err(why) => assert!(!allowed && why.contains("tune"), "seed {seed}: {path} = {value}: {why}"),
+            }
+            *(if allowed { &mut taken } else { &mut refused }) += 1;
+        }
+        assert!(taken > 500 && refused > 500, "{taken} taken, {refused} refused");
+    }
 }

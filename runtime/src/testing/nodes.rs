@@ -60,6 +60,7 @@ pub fn rig(name: &str, address: &str, period_ns: u64, nodes: Vec<Node>) -> Rig {
         overrun: Overrun::Stop,
         stops: Vec::new(),
         record: Vec::new(),
+        plots: Vec::new(),
         predict: None,
         needs_look: false,
         plant: Plant { applied: Vec::new(), seen: Vec::new(), inertia: None },

@@ -118,6 +118,7 @@ pub fn judge(control: &Instance) -> Judge {
             range(1, "d", "N·m·s/rad", true, None),
             Check::Require { message, value: judged.outputs.slot(2) },
         ],
+        tuned: Vec::new(),
     };
     Judge::new(live, program, control).expect("both have three parameters")
 }

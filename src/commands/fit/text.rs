@@ -152,6 +152,9 @@ fn experiment<'a>(
             FitStatement::Experiment(ExperimentStatement::Plot(one)) => {
                 let _ = writeln!(out, "{}", slice(one.span));
             }
+            FitStatement::Experiment(ExperimentStatement::Tune(_, span)) => {
+                let _ = writeln!(out, "{}", slice(*span));
+            }
             FitStatement::Experiment(ExperimentStatement::Expect(one)) => {
                 let _ = writeln!(out, "{}", slice(one.span));
             }

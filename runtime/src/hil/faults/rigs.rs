@@ -280,6 +280,7 @@ pub fn judge(control: &Instance) -> Judge {
     let live = Live {
         params: vec![param(0, "first"), param(1, "second")],
         checks: vec![Check::Require { message: "they fit".into(), value: judged.outputs.slot(0) }],
+        tuned: Vec::new(),
     };
     Judge::new(live, program, control).expect("both have the two parameters")
 }
