@@ -947,8 +947,8 @@ pub struct Watch {
 /// `fric panel`
 #[derive(clap::Args, Debug)]
 pub struct Panel {
-    /// A text with experiments, or a log of `fric hil`
-    #[arg(value_hint = ValueHint::FilePath)]
+    /// A text with experiments, a log of `fric hil`, or USER@HOST: the rig that `fric-rig` runs there, through ssh
+    #[arg(value_name = "FILE|LOG|USER@HOST", value_hint = ValueHint::FilePath)]
     pub file: PathBuf,
     /// Experiments of the text to offer; all if none is named
     pub experiments: Vec<String>,
@@ -964,6 +964,15 @@ pub struct Panel {
     /// Print the link, and open no browser
     #[arg(long)]
     pub no_open: bool,
+    /// With USER@HOST: option for ssh, such as Port=2222
+    #[arg(short = 'o', value_name = "NAME=VALUE")]
+    pub options: Vec<String>,
+    /// With USER@HOST: the program there
+    #[arg(long, value_name = "COMMAND", default_value = "fric-rig")]
+    pub rig: String,
+    /// With USER@HOST: folder of packages and logs there
+    #[arg(long, value_name = "DIR", default_value = "/var/lib/fric")]
+    pub dir: String,
     /// The log is that of a rig that this process is beside: the section `started` of its head
     #[arg(long, hide = true, conflicts_with = "save")]
     pub of_rig: Option<String>,

@@ -6,7 +6,7 @@
 use abi::foreign::shown;
 use std::io::{BufRead, BufReader};
 use std::path::Path;
-use std::process::{Command, Output, Stdio};
+use std::process::{Child, Command, Output, Stdio};
 
 /// A computer that is reached by ssh.
 pub struct Remote {
@@ -66,6 +66,17 @@ impl Remote {
         let lines = BufReader::new(child.stdout.take().expect("it is piped")).lines();
         lines.map_while(Result::ok).for_each(|line| told(&shown(&line)));
         ended("ssh", child.wait_with_output().map_err(failed)?).map(|_| ())
+    }
+
+    /// Starts a command there that is spoken with through its standard streams. What it says on the standard error is
+    /// seen here.
+    ///
+    /// # Errors
+    /// Why it failed.
+    pub fn start(&self, words: &[&str]) -> Result<Child, Failed> {
+        let mut command = self.command(words);
+        command.stdin(Stdio::piped()).stdout(Stdio::piped());
+        command.spawn().map_err(|error| Failed::Unreachable(format!("cannot run ssh: {error}")))
     }
 
     fn command(&self, words: &[&str]) -> Command {

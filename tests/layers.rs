@@ -19,8 +19,8 @@ const CRATES: [(&str, &str, &[&str]); 7] = [
     ("abi", "abi/src/lib.rs", &[]),
     ("compiler", "compiler/src/lib.rs", &["grammar", "abi"]),
     ("runtime", "runtime/src/lib.rs", &["abi"]),
-    ("panel", "panel/src/lib.rs", &[]),
-    ("fric-rig", "rig/src/main.rs", &["abi", "runtime"]),
+    ("panel", "panel/src/lib.rs", &["abi", "runtime"]),
+    ("fric-rig", "rig/src/main.rs", &["abi", "runtime", "panel"]),
     ("fric", "src/main.rs", &["grammar", "abi", "compiler", "runtime", "panel"]),
 ];
 
@@ -70,7 +70,7 @@ const HOMES: &[(&str, &[&str])] = &[
     ("stacker", &["grammar/src/parse.rs"]),
     ("strsim", &["compiler/src/frontend/names.rs"]),
     ("subsetter", &["src/plot/pdf.rs"]),
-    ("tempfile", &["src/commands/deploy.rs", "src/commands/panel.rs"]),
+    ("tempfile", &["src/commands/deploy.rs", "src/commands/panel.rs", "src/commands/remote_rig.rs"]),
     ("terminal_size", &["src/terminal.rs"]),
     // A socket begins as a request.
     ("tungstenite", &["panel/src/http.rs", "panel/src/viewer.rs"]),

@@ -19,6 +19,8 @@ mod run;
 
 mod drives;
 
+mod panel;
+
 use clap::{Parser, Subcommand, ValueHint};
 use runtime::drive::serve::Doors;
 use runtime::record::parts;
@@ -46,6 +48,10 @@ enum Command {
     Start(Start),
     /// Simulate the drives and devices of a package on a bus that other programs can reach
     Drives(Drives),
+    /// Show the running rig in a browser on this computer, with its commands
+    Panel(PanelArgs),
+    /// Send the running rig to `fric panel USER@HOST`, and its commands here, on the standard streams
+    Feed(Store),
     /// Command the running rig: enable, arm, set PATH = VALUE or stop
     Say(Say),
     /// Check this computer for real time, and print what to change
@@ -124,12 +130,35 @@ struct RunArgs {
     /// The log [default: DIR/log/RIG-TIME.friclog]
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
     log: Option<PathBuf>,
+    /// Open a panel for browsers beside it, in a process of its own
+    #[arg(long, conflicts_with_all = ["fast", "check"])]
+    panel: bool,
+    /// Port of the panel on this computer; if it is taken, the next free one
+    #[arg(long, value_name = "PORT", requires = "panel", default_value_t = ::panel::server::PORT)]
+    port: u16,
     #[command(flatten)]
     sizes: Sizes,
     #[command(flatten)]
     store: Store,
     #[command(flatten)]
     trust: Trust,
+}
+
+#[derive(clap::Args, Debug)]
+struct PanelArgs {
+    /// Port on this computer; if it is taken, the next free one
+    #[arg(long, value_name = "PORT", default_value_t = ::panel::server::PORT)]
+    port: u16,
+    /// Curves in memory; what is older is left out
+    #[arg(long, value_name = "SIZE", value_parser = parts::bytes, default_value = "256MB")]
+    keep: u64,
+    /// It is the child of `run --panel`
+    #[arg(long, hide = true)]
+    of_run: bool,
+    #[command(flatten)]
+    store: Store,
+    #[command(flatten)]
+    keys: Keys,
 }
 
 #[derive(clap::Args, Debug)]
@@ -302,6 +331,7 @@ fn ran(args: &RunArgs) -> Result<u8, String> {
         buses: &args.bus,
         log: args.log.as_deref(),
         limits: args.sizes.limits(),
+        panel: args.panel.then_some(args.port),
     };
     run::run(&wanted)
 }
@@ -328,6 +358,18 @@ fn main() -> ExitCode {
         }
         Command::Run(run) => return ended(ran(run)),
         Command::Drives(drives) => return ended(served(drives)),
+        Command::Panel(args) => {
+            let PanelArgs { port, keep, of_run, store, keys } = args;
+            let (dir, trusted) = (&store.dir, &keys.trusted);
+            return ended(panel::panel(&panel::PanelArguments {
+                dir,
+                trusted,
+                port: *port,
+                keep: *keep,
+                of_run: *of_run,
+            }));
+        }
+        Command::Feed(store) => return ended(panel::feed(&store.dir)),
         Command::Start(start) => {
             let trust = run::Trust { trusted: &start.trust.keys.trusted, allow_unsigned: start.trust.allow_unsigned };
             run::start(&start.store.dir, start.hash.as_deref(), trust, start.sizes.limits())

@@ -19,12 +19,16 @@ use runtime::realtime::clock::Clock;
 use runtime::record::log::{Sections, Settings, Sink};
 use runtime::record::parts::{self, Limits};
 use std::fs;
-use std::io::{BufRead, BufReader, Read, Write};
+use std::io::{BufRead, BufReader, Read, Take, Write};
+use std::net::Shutdown;
 use std::os::unix::net::{UnixListener, UnixStream};
+use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex};
-use std::time::{Duration, SystemTime, UNIX_EPOCH};
+use std::process::{Child, Stdio};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::mpsc::{self, SyncSender};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 /// Interval at which the state is written and the installed package checked.
 const LOOK: Duration = Duration::from_millis(100);
@@ -53,6 +57,8 @@ pub struct RunArguments<'a> {
     pub log: Option<&'a Path>,
     /// Its size limits.
     pub limits: Limits,
+    /// Port of a panel, which is a process of its own; none: no panel.
+    pub panel: Option<u16>,
 }
 
 /// Result of a run.
@@ -82,7 +88,7 @@ pub fn run(wanted: &RunArguments) -> Result<u8, String> {
         let installed = || store.current_target().unwrap_or_else(|| "current".into());
         let target = wanted.package.map_or_else(installed, Path::to_path_buf);
         let path = if wanted.package.is_some() { target.clone() } else { wanted.dir.join(&target) };
-        let ended = packed::open(&path, wanted.trusted).and_then(|open| once(wanted, &open, &store, &target));
+        let ended = packed::open(&path, wanted.trusted).and_then(|open| once(wanted, &open, &store, &target, &path));
         let ended = match ended {
             Ok(ended) => ended,
             // The previous package runs instead; if that does not start either, nothing runs.
@@ -110,7 +116,8 @@ pub fn run(wanted: &RunArguments) -> Result<u8, String> {
     }
 }
 
-fn once(wanted: &RunArguments, open: &Open, store: &Store, target: &Path) -> Result<Ended, String> {
+/// `package`: the file of `open`.
+fn once(wanted: &RunArguments, open: &Open, store: &Store, target: &Path, package: &Path) -> Result<Ended, String> {
     if wanted.fast && wanted.duration.is_none() && !wanted.check {
         return Err(session::FAST_WITHOUT_END.into());
     }
@@ -145,6 +152,13 @@ fn once(wanted: &RunArguments, open: &Open, store: &Store, target: &Path) -> Res
             (Box::new(time), buses)
         }
     };
+    // Before this thread is set up for real time: a child inherits its processors.
+    let _panel = wanted.panel.map(|port| beside(wanted, port)).transpose()?;
+    let facts = Facts {
+        log: absolute(&path),
+        started: log.1.text("started").unwrap_or_default().to_string(),
+        package: absolute(package),
+    };
     let setup = Setup {
         rig: &rig,
         control,
@@ -167,8 +181,9 @@ fn once(wanted: &RunArguments, open: &Open, store: &Store, target: &Path) -> Res
     let operator = session.operator().filter(|_| !drives.is_fast());
     let gauges = session.hil.gauges();
     let attendant =
-        operator.map(|operator| Attendant::new(wanted, store, target, gauges, operator.by_the_wall(), judge));
+        operator.map(|operator| Attendant::new(wanted, store, target, gauges, operator.by_the_wall(), judge, facts));
     let end = session.run();
+    attendant.iter().for_each(|attendant| attendant.tell_end(&end.words()));
     let replaced = attendant.as_ref().is_some_and(|attendant| attendant.replaced.load(Ordering::Relaxed));
     drop(attendant);
     let finished = session.finish();
@@ -205,10 +220,26 @@ fn log(wanted: &RunArguments, open: &Open, rig: &Rig, drives: Drives) -> Result<
     Ok((session::log_settings(rig, Sink::File(path, wanted.limits), drives), head))
 }
 
+/// The same place from every folder.
+fn absolute(path: &Path) -> PathBuf {
+    std::path::absolute(path).unwrap_or_else(|_| path.to_path_buf())
+}
+
+/// Starts the panel of a run, in a process of its own. It ends by itself once the run has ended and nobody looks.
+fn beside(wanted: &RunArguments, port: u16) -> Result<Child, String> {
+    let about = |error: std::io::Error| format!("no panel: {error}");
+    let mut command = std::process::Command::new(std::env::current_exe().map_err(about)?);
+    command.args(["panel", "--of-run", "--port", &port.to_string(), "--dir"]).arg(wanted.dir);
+    command.arg("--trusted").arg(wanted.trusted);
+    // In a process group of its own: Ctrl-C stops the rig, and the panel shows how it ended.
+    command.process_group(0).stdin(Stdio::piped()).spawn().map_err(about)
+}
+
 /// Threads beside the cycle: they write the state, accept commands, and detect that another package has been installed.
 struct Attendant {
     over: Arc<AtomicBool>,
     replaced: Arc<AtomicBool>,
+    desk: Arc<Desk>,
     threads: Vec<std::thread::JoinHandle<()>>,
     dir: PathBuf,
 }
@@ -221,10 +252,14 @@ impl Attendant {
         gauges: Arc<Gauges>,
         operator: Operator,
         judge: Judge,
+        facts: Facts,
     ) -> Attendant {
         let [over, replaced] = [(); 2].map(|()| Arc::new(AtomicBool::new(false)));
         let stopper = operator.stopper();
-        let desk = Arc::new(Desk { operator: Mutex::new(operator), stopper: stopper.clone(), judge });
+        let (gauges_told, ended, panels) = (gauges.clone(), Mutex::default(), AtomicUsize::new(0));
+        let operator = Mutex::new(operator);
+        let desk =
+            Arc::new(Desk { operator, stopper: stopper.clone(), judge, facts, gauges: gauges_told, ended, panels });
         let dir = wanted.dir.to_path_buf();
         let mut threads = Vec::new();
         {
@@ -249,7 +284,7 @@ impl Attendant {
         let socket = socket(&dir);
         let _ = fs::remove_file(&socket);
         if let Ok(listener) = UnixListener::bind(&socket) {
-            let over = over.clone();
+            let (over, desk) = (over.clone(), desk.clone());
             threads.push(std::thread::spawn(move || {
                 for stream in listener.incoming().flatten() {
                     if over.load(Ordering::Relaxed) {
@@ -261,7 +296,16 @@ impl Attendant {
                 }
             }));
         }
-        Attendant { over, replaced, threads, dir }
+        Attendant { over, replaced, desk, threads, dir }
+    }
+
+    /// Tells all panels how the run ended.
+    fn tell_end(&self, words: &str) {
+        *self.desk.ended.lock().unwrap_or_else(PoisonError::into_inner) = Some(words.into());
+        let begun = Instant::now();
+        while self.desk.panels.load(Ordering::Relaxed) > 0 && begun.elapsed() < 2 * DEAF {
+            std::thread::sleep(Duration::from_millis(5));
+        }
     }
 }
 
@@ -278,7 +322,8 @@ impl Drop for Attendant {
     }
 }
 
-fn socket(dir: &Path) -> PathBuf {
+/// The socket of the rig that runs in a folder.
+pub fn socket(dir: &Path) -> PathBuf {
     dir.join("control")
 }
 
@@ -304,6 +349,37 @@ struct Desk {
     operator: Mutex<Operator>,
     stopper: Stopper,
     judge: Judge,
+    facts: Facts,
+    gauges: Arc<Gauges>,
+    /// How the run ended.
+    ended: Mutex<Option<String>>,
+    /// Panels that are connected.
+    panels: AtomicUsize,
+}
+
+/// What a panel must know to find the log of a run.
+struct Facts {
+    /// The first file of its log.
+    log: PathBuf,
+    /// As in the head of the log.
+    started: String,
+    package: PathBuf,
+}
+
+/// Panels at the same time.
+const PANELS: usize = 8;
+/// Commands of a panel that wait; more are refused. A stop never waits.
+const WAITING: usize = 16;
+/// Time in which a line to a panel must be taken.
+const DEAF: Duration = Duration::from_millis(200);
+/// Intervals at which the stage is looked at, and at which the time is told.
+const TOLD: (Duration, Duration) = (Duration::from_millis(20), Duration::from_millis(100));
+
+/// Tells a panel something; false if it does not listen.
+fn tell_panel(to: &Mutex<&UnixStream>, line: &str) -> bool {
+    let clean: String = line.chars().map(|c| if c.is_control() { ' ' } else { c }).collect();
+    let mut to = to.lock().unwrap_or_else(PoisonError::into_inner);
+    to.write_all(format!("{clean}\n").as_bytes()).is_ok()
 }
 
 /// Time within which a connected client must send its command.
@@ -314,11 +390,102 @@ impl Desk {
     fn attend(&self, stream: &UnixStream) {
         let mut line = String::new();
         let _ = stream.set_read_timeout(Some(SPEAKS));
-        if BufReader::new(stream.take(MOST_SAID)).read_line(&mut line).is_err() || line.trim().is_empty() {
+        let mut lines = BufReader::new(stream.take(MOST_SAID));
+        if lines.read_line(&mut line).is_err() || line.trim().is_empty() {
             return;
+        }
+        if line.trim() == "attend" {
+            return self.attend_panel(stream, lines);
         }
         let said = self.carry_out(line.trim());
         let _ = (&*stream).write_all(format!("{}\n", said.err().unwrap_or_else(|| "ok".into())).as_bytes());
+    }
+
+    /// Serves a panel until the run or the connection ends.
+    fn attend_panel(&self, stream: &UnixStream, lines: BufReader<Take<&UnixStream>>) {
+        let to = Mutex::new(stream);
+        if self.panels.fetch_add(1, Ordering::Relaxed) < PANELS {
+            let _ = stream.set_read_timeout(None);
+            let _ = stream.set_write_timeout(Some(DEAF));
+            let Facts { log, started, package } = &self.facts;
+            let facts = format!("log {}\nstarted {started}\npackage {}", log.display(), package.display());
+            if facts.lines().all(|line| tell_panel(&to, line)) {
+                let (send, queue) = mpsc::sync_channel(WAITING);
+                let gone = AtomicBool::new(false);
+                let (gone, to) = (&gone, &to);
+                std::thread::scope(|scope| {
+                    scope.spawn(move || self.tell_stage(to, gone));
+                    scope.spawn(move || self.answer(to, &queue));
+                    self.listen(lines, to, &send);
+                    gone.store(true, Ordering::Relaxed);
+                    drop(send);
+                });
+            }
+        } else {
+            tell_panel(&to, &format!("refused {PANELS} panels are connected already"));
+        }
+        self.panels.fetch_sub(1, Ordering::Relaxed);
+    }
+
+    /// Tells the stage, the time and the end of the run.
+    fn tell_stage(&self, to: &Mutex<&UnixStream>, gone: &AtomicBool) {
+        let (mut last, mut told) = (String::new(), None::<Instant>);
+        while !gone.load(Ordering::Relaxed) {
+            let ended = self.ended.lock().unwrap_or_else(PoisonError::into_inner).clone();
+            let stage = self.gauges.stage.get();
+            let line = format!("stage {} {stage}", stage.awaits());
+            let mut heard = line == last || tell_panel(to, &line);
+            last = line;
+            if told.is_none_or(|told| told.elapsed() >= TOLD.1) {
+                let Stamp::Wall(ns) = Stamp::wall() else { unreachable!("that is what it gives") };
+                heard &= tell_panel(to, &format!("now {ns}"));
+                told = Some(Instant::now());
+            }
+            if let Some(words) = &ended {
+                tell_panel(to, &format!("over {words}"));
+            }
+            if ended.is_some() || !heard {
+                let _ = to.lock().unwrap_or_else(PoisonError::into_inner).shutdown(Shutdown::Both);
+                return;
+            }
+            std::thread::sleep(TOLD.0);
+        }
+    }
+
+    /// Reads commands. A stop is carried out here, whatever waits.
+    fn listen(
+        &self,
+        mut lines: BufReader<Take<&UnixStream>>,
+        to: &Mutex<&UnixStream>,
+        send: &SyncSender<(u64, String)>,
+    ) {
+        let mut line = String::new();
+        loop {
+            line.clear();
+            lines.get_mut().set_limit(MOST_SAID);
+            if !lines.read_line(&mut line).is_ok_and(|n| n > 0) {
+                return;
+            }
+            let Some((number, said)) = line.trim().split_once(' ') else { continue };
+            let Ok(number) = number.parse::<u64>() else { continue };
+            let command = said.strip_prefix('@').and_then(|rest| rest.split_once(' ')).map_or(said, |(_, rest)| rest);
+            if command == "stop" {
+                self.stopper.stop();
+                tell_panel(to, &format!("ok {number}"));
+            } else if send.try_send((number, said.to_string())).is_err() {
+                tell_panel(to, &format!("refused {number} {WAITING} commands wait already: say it again"));
+            }
+        }
+    }
+
+    /// Carries out commands in their order.
+    fn answer(&self, to: &Mutex<&UnixStream>, queue: &mpsc::Receiver<(u64, String)>) {
+        for (number, said) in queue {
+            match self.carry_out(&said) {
+                Ok(()) => tell_panel(to, &format!("ok {number}")),
+                Err(why) => tell_panel(to, &format!("refused {number} {}", why.trim_start_matches("refused: "))),
+            };
+        }
     }
 
     /// Executes `@NS COMMAND`: a command and the time at which it was given, by the monotonic clock of this computer.
@@ -361,7 +528,7 @@ impl Desk {
 }
 
 /// Longest command, bytes.
-const MOST_SAID: u64 = 1 << 16;
+pub const MOST_SAID: u64 = 1 << 16;
 
 /// Sends a command to the running rig.
 pub fn say(dir: &Path, what: &str) -> Result<String, String> {

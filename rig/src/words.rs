@@ -17,6 +17,12 @@ pub fn is_read(text: &str) -> bool {
     out.write_all(shown(text).as_bytes()).and_then(|()| out.flush()).is_ok()
 }
 
+/// Writes bytes to the standard output as they are, for a program at its other end; returns whether it is still open.
+pub fn is_written(bytes: &[u8]) -> bool {
+    let mut out = std::io::stdout().lock();
+    out.write_all(bytes).and_then(|()| out.flush()).is_ok()
+}
+
 /// Prints a report that is no failure to the standard error.
 pub fn report(text: &str) {
     let _ = std::io::stderr().lock().write_all(shown(text).as_bytes());

@@ -5,19 +5,11 @@
 //! commands of its viewers, as lines from its standard output. Its curves it reads from the log by itself. If it dies,
 //! the rig does not notice.
 //!
-//! ```text
-//! to the panel      stage NEXT WORDS      NEXT: `enable`, `arm`, or `-` where no command is awaited
-//!                   ok NUMBER             over WORDS
-//!                   refused NUMBER WORDS
-//! from the panel    link URL              once
-//!                   NUMBER COMMAND        as at the prompt
-//! ```
+//! The lines are those of [`panel::operated`]; its first one is `link URL`.
 
 use crate::terminal::Terminal;
-use runtime::drive::Step;
 use runtime::hil::cycle::Gauges;
 use runtime::hil::operator::Stopper;
-use runtime::hil::stage::Stage;
 use std::io::{BufRead, BufReader, Write};
 use std::os::unix::process::CommandExt;
 use std::path::Path;
@@ -110,12 +102,7 @@ impl Beside {
         let mut last = String::new();
         while !over.load(Ordering::Relaxed) {
             let stage = gauges.stage.get();
-            let next = match stage {
-                Stage::StartUp(Step::AwaitEnable) => "enable",
-                Stage::StartUp(Step::AwaitArm) => "arm",
-                Stage::StartUp(_) | Stage::QuickStop | Stage::TorqueOff => "-",
-            };
-            let line = format!("stage {next} {stage}");
+            let line = format!("stage {} {stage}", stage.awaits());
             if line != last {
                 told.say(&line);
                 last = line;

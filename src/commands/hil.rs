@@ -359,11 +359,7 @@ fn run(
     }
     let finished = session.finish();
     if let Some(told) = told {
-        told.over(&match &end {
-            cycle::End::Asked => "ended as asked".to_string(),
-            cycle::End::Refused(why) => format!("refused: {why}"),
-            cycle::End::Stopped(_, why) => format!("stopped: {why}"),
-        });
+        told.over(&end.words());
     }
     finish(args, finished, end, log_path, terminal)
 }

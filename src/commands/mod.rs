@@ -20,6 +20,7 @@ mod inspect;
 mod key;
 mod linearise;
 mod new;
+mod remote_rig;
 mod panel;
 mod predict;
 mod watch;

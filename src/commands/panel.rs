@@ -1,33 +1,30 @@
 //! `fric panel`: a simulation that changes under the hand, or a recording, in a browser.
 
 use super::End;
+use super::remote_rig::{self, Feed};
 use crate::args::Panel as Args;
 use crate::commands::shared::rig_log::{self, Opened};
 use crate::compile::Options;
 use crate::interrupt::on_interrupt;
 use crate::project;
-use crate::shown::operated::Operated;
-use crate::shown::recording::{Played, Recording};
 use crate::shown::what_if::WhatIf;
 use crate::terminal::Terminal;
+use panel::follow::{self, LOOK};
+use panel::operated::{self, Operated};
+use panel::recording::{Played, Recording};
 use panel::report::report;
 use panel::server::{Bell, Panel};
 use panel::subject::Subject;
-use runtime::record::blocks::{End as LogEnd, MAGIC};
+use runtime::record::blocks::MAGIC;
 use runtime::record::claim::is_claimed;
-use runtime::record::log::Reader;
 use std::fs::File;
 use std::io::{BufRead, Read, Write};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::sync::Arc;
+use std::sync::atomic::Ordering;
 use std::sync::mpsc;
-use std::time::{Duration, Instant};
 
-/// Polling interval of a log that grows: its writer appends to it ten times a second.
-const LOOK: Duration = Duration::from_millis(20);
-/// Time for which the panel of a rig that has ended waits for a page.
-const REMAINS: Duration = Duration::from_secs(5);
 /// Columns of a recording's report: four times those of a wide window.
 const REPORT_COLUMNS: u32 = 4096;
 
@@ -49,7 +46,10 @@ impl Content {
 pub fn panel(args: &Args, terminal: &mut Terminal) -> End {
     let bell = Bell::default();
     if let Some(started) = &args.of_rig {
-        return of_rig(args, started, bell, terminal);
+        return of_rig(args, started, &bell, terminal);
+    }
+    if let Some(host) = remote_rig::host(&args.file) {
+        return of_host(args, &host, &bell, terminal);
     }
     let shown = if is_log(&args.file) {
         if !args.experiments.is_empty() {
@@ -97,57 +97,64 @@ fn recording(args: &Args, bell: &Bell, terminal: &Terminal) -> Result<Arc<Played
     let name = args.file.display().to_string();
     let mut recording = Recording::new(&name, &ready.rig, ready.control.description(), &control, args.keep);
     let grows = is_claimed(&args.file) && args.save.is_none();
-    read_on(&mut reader, &mut recording)?;
+    follow::read_on(&mut reader, &mut recording)?;
     if recording.is_empty() && !grows {
         return Err("it holds no cycle".into());
     }
     if !grows || reader.tail().is_some() {
-        recording.end(rig_log::ending(&reader, "it").unwrap_or_else(|damaged| damaged));
+        recording.end(reader.ending("it").unwrap_or_else(|damaged| damaged));
         return Ok(Arc::new(Played::new(recording)));
     }
     let (played, bell, file) = (Arc::new(Played::new(recording)), bell.clone(), args.file.clone());
     let followed = played.clone();
     std::thread::Builder::new()
         .name("log".into())
-        .spawn(move || follow(reader, &followed, &file, &bell))
+        .spawn(move || follow::follow(reader, &followed, &|| is_claimed(&file), &bell))
         .map_err(|error| error.to_string())?;
     Ok(played)
 }
 
-/// Follows a log until its writer has ended it.
-fn follow(mut reader: Reader, played: &Played, file: &Path, bell: &Bell) {
-    let mut grows = true;
-    while grows {
-        std::thread::sleep(LOOK);
-        // Asked first: what is written until the claim is given up is in the file then.
-        grows = is_claimed(file);
-        let mut recording = played.recording();
-        let read = reader.resume().map_err(|error| error.to_string());
-        let read = read.and_then(|()| read_on(&mut reader, &mut recording));
-        grows &= read.is_ok() && reader.tail().is_none() && !matches!(reader.end(), Some(LogEnd::Damaged { .. }));
-        match read {
-            Ok(0) if grows => continue,
-            Ok(_) if grows => recording.added(),
-            Ok(_) => recording.end(rig_log::ending(&reader, "it").unwrap_or_else(|damaged| damaged)),
-            Err(why) => recording.end(why),
+/// A panel with the commands of a rig's operator, and the link that opens it.
+fn operate(
+    args: &Args,
+    operated: &Arc<Operated>,
+    bell: &Bell,
+    terminal: &mut Terminal,
+) -> Result<(Panel, String), End> {
+    match Panel::open(args.port, operated.clone(), bell.clone()) {
+        Ok(open) => {
+            let link = open.link();
+            Ok((open, link))
         }
-        drop(recording);
-        bell.ring();
+        Err(why) => {
+            terminal.error(&format!("no panel: {why}"));
+            Err(End::Failed)
+        }
+    }
+}
+
+/// Shows the log of a rig that runs, once it has begun: for a thread of its own. `more`: whether it may still grow.
+fn show_log(operated: &Operated, file: &Path, interpret: bool, keep: u64, bell: &Bell, more: &dyn Fn() -> bool) {
+    match rig_log::open(file, interpret, &Terminal::new()) {
+        Ok(Opened { reader, ready, control }) => {
+            let name = file.display().to_string();
+            let recording = Recording::new(&name, &ready.rig, ready.control.description(), &control, keep);
+            let played = Arc::new(Played::new(recording));
+            operated.begins(played.clone(), &ready.live, &ready.control);
+            follow::follow(reader, &played, more, bell);
+        }
+        Err(why) => operated.told(&format!("problem its log cannot be shown: {why}")),
     }
 }
 
 /// Beside a rig that runs: see [`super::beside`]. Ends with the last page that shows it, once the rig has ended.
-fn of_rig(args: &Args, started: &str, bell: Bell, terminal: &mut Terminal) -> End {
+fn of_rig(args: &Args, started: &str, bell: &Bell, terminal: &mut Terminal) -> End {
     let name = args.file.file_stem().unwrap_or_default().to_string_lossy().into_owned();
     let operated = Arc::new(Operated::new(&name, Box::new(std::io::stdout()), bell.clone()));
-    let open = match Panel::open(args.port, operated.clone(), bell.clone()) {
+    let (open, link) = match operate(args, &operated, bell, terminal) {
         Ok(open) => open,
-        Err(why) => {
-            terminal.error(&format!("no panel: {why}"));
-            return End::Failed;
-        }
+        Err(end) => return end,
     };
-    let link = open.link();
     terminal.line(&format!("link {link}"));
     let _door = (!args.no_open).then(|| show(&link)).flatten();
     std::thread::spawn(move || open.serve());
@@ -155,51 +162,73 @@ fn of_rig(args: &Args, started: &str, bell: Bell, terminal: &mut Terminal) -> En
         let (operated, file, bell) = (operated.clone(), args.file.clone(), bell.clone());
         let (started, interpret, keep) = (started.to_string(), args.interpret, args.keep);
         std::thread::spawn(move || {
-            let is_ours = || Reader::open(&file).is_ok_and(|reader| reader.head.text("started") == Some(&started));
-            while !is_ours() {
+            while !follow::is_of(&file, &started) {
                 if operated.is_over() {
                     return;
                 }
                 std::thread::sleep(LOOK);
             }
-            match rig_log::open(&file, interpret, &Terminal::new()) {
-                Ok(Opened { reader, ready, control }) => {
-                    let name = file.display().to_string();
-                    let recording = Recording::new(&name, &ready.rig, ready.control.description(), &control, keep);
-                    let played = Arc::new(Played::new(recording));
-                    operated.begins(played.clone(), &ready.live, &ready.control);
-                    follow(reader, &played, &file, &bell);
-                }
-                Err(why) => operated.told(&format!("problem its log cannot be shown: {why}")),
-            }
+            show_log(&operated, &file, interpret, keep, &bell, &|| is_claimed(&file));
         });
     }
     for line in std::io::stdin().lock().lines() {
         let Ok(line) = line else { break };
         operated.told(&line);
     }
-    operated.left();
-    // A page that is loaded again has no connection for a moment.
-    let mut alone = Instant::now();
-    while alone.elapsed() < REMAINS {
-        std::thread::sleep(Duration::from_millis(100));
-        if bell.viewers() > 0 {
-            alone = Instant::now();
-        }
-    }
+    operated.left("the process of the rig was killed");
+    operated::remain(bell);
     End::Fine
 }
 
-/// Adds all messages that can be read now; returns their number.
-fn read_on(reader: &mut Reader, recording: &mut Recording) -> Result<u64, String> {
-    let mut added = 0;
-    while let Some(message) = reader.message().map_err(|error| error.to_string())? {
-        if !recording.add(&message) {
-            return Err("it holds a cycle that is not of this rig".into());
-        }
-        added += 1;
+/// The rig that runs on another computer.
+fn of_host(args: &Args, host: &str, bell: &Bell, terminal: &mut Terminal) -> End {
+    if args.save.is_some() || !args.experiments.is_empty() {
+        terminal.error(&format!(
+            "{host} is a computer with a rig that runs: it has no experiments, and --save needs its log, which \
+             `fric fetch-log {host}` fetches"
+        ));
+        return End::Misused;
     }
-    Ok(added)
+    let (mut feed, operated) = match Feed::of(host, args, bell) {
+        Ok(both) => both,
+        Err(why) => {
+            terminal.error(&why);
+            return End::Failed;
+        }
+    };
+    let (open, link) = match operate(args, &operated, bell, terminal) {
+        Ok(open) => open,
+        Err(end) => return end,
+    };
+    terminal.line(&format!("panel  {link}"));
+    let _door = (!args.no_open).then(|| show(&link)).flatten();
+    std::thread::spawn(move || open.serve());
+    let (begun, first) = mpsc::channel::<PathBuf>();
+    let following = {
+        let (operated, bell, goes_on) = (operated.clone(), bell.clone(), feed.goes_on.clone());
+        let (started, interpret, keep) = (feed.started.clone(), args.interpret, args.keep);
+        std::thread::spawn(move || {
+            let Ok(file) = first.recv() else { return };
+            let more = || goes_on.load(Ordering::Relaxed);
+            // Its head is whole with its first block.
+            while !follow::is_of(&file, &started) && more() {
+                std::thread::sleep(LOOK);
+            }
+            show_log(&operated, &file, interpret, keep, &bell, &more);
+        })
+    };
+    let ended = feed.run(&operated, &begun);
+    drop(begun);
+    feed.goes_on.store(false, Ordering::Relaxed);
+    if let Err(why) = &ended {
+        operated.told(&format!("problem {why}"));
+    }
+    operated.left(&format!(
+        "the connection to {host} has ended; the rig may run on, and only the wired stop reaches it from here"
+    ));
+    let _ = following.join();
+    operated::remain(bell);
+    if ended.is_ok() { End::Fine } else { End::Failed }
 }
 
 fn save(path: &Path, shown: &Content, terminal: &mut Terminal) -> End {

@@ -45,7 +45,7 @@ pub fn replay(args: &Args, terminal: &mut Terminal) -> End {
     }
     // A log may continue in further files; the end to report is that of the last file read.
     let last = if reader.path() == args.log { "it".into() } else { reader.path().display().to_string() };
-    let ends = match rig_log::ending(&reader, &last) {
+    let ends = match reader.ending(&last) {
         Ok(ends) => ends,
         Err(why) => return fail(terminal, &why),
     };

@@ -1,10 +1,7 @@
-//! What a panel shows: experiments that run anew at every touch, recordings of rigs, and rigs that run.
+//! What a panel shows of a text: experiments that run anew at every touch.
 //!
-//! In: compiled experiments, or a log. Out: a [`Subject`](panel::subject::Subject) each, whose curves, parameters and
-//! verdicts the crate `panel` brings to browsers.
+//! In: compiled experiments. Out: a [`Subject`](panel::subject::Subject), whose curves, parameters and verdicts the crate
+//! `panel` brings to browsers, as it does those of rigs.
 
-mod knob;
-mod sheet;
+mod typed;
 pub mod what_if;
-pub mod recording;
-pub mod operated;

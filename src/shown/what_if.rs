@@ -4,16 +4,17 @@
 //! values and of two runs that were kept. The text is compiled once; a change of a parameter goes into the compiled
 //! instance. Saving the text compiles it again, and parameters that still exist keep their values.
 
-use super::knob::{self, Knob};
-use super::sheet::Sheet;
+use super::typed;
 use crate::compile::{self, Loaded, Options, Stopwatch, Tuned, Varying};
 use crate::{project, report, results};
 use abi::Slot;
 use abi::format::{count, duration};
 use grammar::diagnostic::Diagnostic;
 use panel::frame::{Block, Frame, PATH};
+use panel::knob::Knob;
 use panel::line::View;
 use panel::server::Bell;
+use panel::sheet::{Sheet, Signal};
 use panel::subject::Subject;
 use panel::thin;
 use panel::words::clean;
@@ -150,7 +151,7 @@ impl FinishedRun {
                 Ok(outcome) => &outcome.recording,
                 Err(failure) => &failure.recording,
             };
-            let curve = |signal: &super::sheet::Signal| {
+            let curve = |signal: &Signal| {
                 let column = recording.columns().iter().position(|column| {
                     column.label == signal.label && column.unit == signal.unit && column.boolean == signal.boolean
                 });
@@ -610,7 +611,7 @@ impl Subject for WhatIf {
         let letter = |letter: &str| KEPT.iter().find(|(name, _)| *name == letter).map(|(_, layer)| *layer);
         match word {
             "set" => {
-                let given = knob::set(rest, &inner.setup.knobs)?;
+                let given = typed::set(rest, &inner.setup.knobs)?;
                 loop {
                     let (setup, before) = (inner.setup.clone(), inner.values.clone());
                     let mut values = before.clone();

@@ -79,6 +79,17 @@ pub enum End {
     Stopped(Cause, String),
 }
 
+impl End {
+    /// How the run ended, in words.
+    pub fn words(&self) -> String {
+        match self {
+            End::Asked => "ended as asked".to_string(),
+            End::Refused(why) => format!("refused: {why}"),
+            End::Stopped(_, why) => format!("stopped: {why}"),
+        }
+    }
+}
+
 /// Values for displays while the rig runs: the cycle writes them, any thread may read them.
 #[derive(Debug, Default)]
 pub struct Gauges {

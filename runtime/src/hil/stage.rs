@@ -28,6 +28,15 @@ impl Stage {
         }
     }
 
+    /// The command that the rig waits for, as it is typed; `-` if none.
+    pub fn awaits(self) -> &'static str {
+        match self {
+            Stage::StartUp(Step::AwaitEnable) => "enable",
+            Stage::StartUp(Step::AwaitArm) => "arm",
+            Stage::StartUp(_) | Stage::QuickStop | Stage::TorqueOff => "-",
+        }
+    }
+
     /// Whether no drive can have torque: none has been enabled yet, or all have been disabled.
     pub fn is_idle(self) -> bool {
         match self {

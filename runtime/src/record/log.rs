@@ -17,7 +17,7 @@ use super::packed;
 use super::parts::{self, Disk, Limits};
 use crate::spsc::{Receiver, Sender, queue};
 use std::collections::VecDeque;
-use std::fs::File;
+use std::fs::{self, File};
 use std::io::{self, BufReader, Write};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -671,6 +671,37 @@ impl Reader {
     pub fn end(&self) -> Option<End> {
         self.blocks.end()
     }
+
+    /// How the log ends, in words, once it was read to its end. `name`: how to call it.
+    ///
+    /// # Errors
+    /// Where it is damaged.
+    pub fn ending(&self, name: &str) -> Result<String, String> {
+        match self.end() {
+            Some(End::Cut { at }) => Ok(format!("{name} is cut off at byte {at}: the writer was killed")),
+            Some(End::Damaged { at }) => Err(format!("{name} is damaged at byte {at}")),
+            Some(End::Whole) | None => Ok(match self.tail().and_then(|tail| tail.text("end")) {
+                Some(end) => format!("it ended {end}"),
+                None => "it was not ended: the writer was killed".into(),
+            }),
+        }
+    }
+}
+
+/// The newest file of the log of a run, which its head calls `started`; none if there is none yet. `first`: where the
+/// first one is, or was before it was removed to make room.
+pub fn newest_part(first: &Path, started: &str) -> Option<PathBuf> {
+    let folder = first.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let number = |entry: fs::DirEntry| {
+        let name = entry.file_name().to_string_lossy().into_owned();
+        let numbers = name.rsplit('.').take(2).filter_map(|part| part.parse::<u32>().ok());
+        let number = numbers.chain([1]).find(|number| parts::path(first, *number).file_name() == Some(name.as_ref()));
+        number.filter(|number| *number > 0)
+    };
+    let mut numbers: Vec<u32> = fs::read_dir(folder).ok()?.flatten().filter_map(number).collect();
+    numbers.sort_unstable_by(|a, b| b.cmp(a));
+    let ours = |path: &PathBuf| Reader::open(path).is_ok_and(|reader| reader.head.text("started") == Some(started));
+    numbers.into_iter().map(|number| parts::path(first, number)).find(ours)
 }
 
 /// Part number and checksum in the head of a file after the first.

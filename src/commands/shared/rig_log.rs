@@ -5,10 +5,8 @@ use crate::compile::{self, Changes, CompiledRig, Options, Stopwatch};
 use crate::report;
 use crate::source_snapshot::Kept;
 use crate::terminal::Terminal;
+use panel::follow;
 use runtime::hil::control::Control;
-use runtime::hil::cycle::look_ahead;
-use runtime::hil::trace;
-use runtime::record::blocks::End;
 use runtime::record::log::Reader;
 use std::path::Path;
 
@@ -31,9 +29,6 @@ pub(in crate::commands) fn open(path: &Path, interpret: bool, terminal: &Termina
     let [Some(rig), Some(file), Some(source), Some(set)] = needed else {
         return Err("its head lacks the text of the rig".into());
     };
-    let Some((bounds, settings)) = head.get("settings").and_then(trace::settings_from_bytes) else {
-        return Err("its head lacks what the drives said of themselves".into());
-    };
     let kept = Kept(&head);
     let mut watch = Stopwatch::start("read");
     let broken = || String::from("the rig in it does not compile");
@@ -44,22 +39,6 @@ pub(in crate::commands) fn open(path: &Path, interpret: bool, terminal: &Termina
         terminal.report(&report::full(&loaded.files.0, &found, terminal.error_colour()));
         broken()
     })?;
-    let look = look_ahead(&ready.rig, &ready.plant)?;
-    let control = Control::new(&ready.rig, ready.control.clone(), look, &bounds, settings)?;
+    let control = follow::control(&head, &ready.rig, &ready.control, &ready.plant)?;
     Ok(Opened { reader, ready, control })
-}
-
-/// How a log ends that was read to its end, in words. `name`: how to call it.
-///
-/// # Errors
-/// Where it is damaged.
-pub(in crate::commands) fn ending(reader: &Reader, name: &str) -> Result<String, String> {
-    match reader.end() {
-        Some(End::Cut { at }) => Ok(format!("{name} is cut off at byte {at}: the writer was killed")),
-        Some(End::Damaged { at }) => Err(format!("{name} is damaged at byte {at}")),
-        Some(End::Whole) | None => Ok(match reader.tail().and_then(|tail| tail.text("end")) {
-            Some(end) => format!("it ended {end}"),
-            None => "it was not ended: the writer was killed".into(),
-        }),
-    }
 }

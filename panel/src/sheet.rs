@@ -1,8 +1,8 @@
 //! How signals share canvases.
 
+use crate::words::clean;
 use abi::plan::{Plot, Series};
 use abi::unit::Unit;
-use panel::words::clean;
 use serde_json::{Value, json};
 
 /// A curve's quantity.

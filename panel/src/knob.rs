@@ -1,10 +1,9 @@
 //! A parameter as a slider: its ends, its scale, and values as typed.
 
-use crate::quantity;
+use crate::words::clean;
 use abi::description::{Quantity, TINY};
 use abi::format;
 use abi::unit::Unit;
-use panel::words::clean;
 use serde_json::{Value, json};
 
 /// A parameter that can be set.
@@ -15,10 +14,11 @@ pub struct Knob {
     /// The unit in which it is shown.
     pub unit: Unit,
     doc: Option<String>,
-    boolean: bool,
+    /// Whether it is a truth value.
+    pub boolean: bool,
     range: (f64, f64),
     /// How far `tune` lets it be set, SI.
-    limit: (f64, f64),
+    pub limit: (f64, f64),
     /// The value of the text, SI.
     pub own: f64,
 }
@@ -86,55 +86,6 @@ impl Knob {
             si => format::quantity(si, &self.unit, 9),
         }
     }
-
-    /// A typed value in SI.
-    ///
-    /// # Errors
-    /// What is wrong with it.
-    pub fn value(&self, text: &str) -> Result<f64, String> {
-        if self.boolean {
-            return match text {
-                "true" => Ok(1.0),
-                "false" => Ok(0.0),
-                _ => Err(format!("`{}` is true or false, not `{}`", self.path, clean(text))),
-            };
-        }
-        // A value without end has no unit; only where the text has one.
-        if text == "inf" && self.own == f64::INFINITY || text == "-inf" && self.own == f64::NEG_INFINITY {
-            return Ok(self.own);
-        }
-        let (si, unit) = quantity::parse(text).map_err(|why| clean(&why))?;
-        if unit.dimension == self.unit.dimension || si == 0.0 && unit.text.is_empty() {
-            let (low, high) = self.limit;
-            if si < low || si > high {
-                let [low, high, si] = [low, high, si].map(|si| self.text(si));
-                return Err(format!("E0502: `{}` is tuned from {low} to {high}, not to {si}", self.path));
-            }
-            return Ok(si);
-        }
-        let (wanted, found) = (self.unit.dimension.describe(), unit.dimension.describe());
-        Err(format!("`{}` is {wanted}, not {found}: type it as in {}", self.path, self.text(self.own)))
-    }
-}
-
-/// Reads `PATH = VALUE, …`: the numbers of the knobs and their values in SI.
-///
-/// # Errors
-/// What is wrong with it; then nothing is set.
-pub fn set(text: &str, knobs: &[Knob]) -> Result<Vec<(usize, f64)>, String> {
-    let one = |text: &str| {
-        let Some((path, value)) = text.split_once('=') else {
-            return Err(format!("`{}` sets nothing: write it as PATH = VALUE", clean(text.trim())));
-        };
-        let path = path.trim();
-        let Some(at) = knobs.iter().position(|knob| knob.path == path) else {
-            let near = crate::compile::nearest(path, knobs.iter().map(|knob| knob.path.as_str()));
-            let help = near.map_or(String::new(), |near| format!("; did you mean `{near}`?"));
-            return Err(format!("there is no parameter `{}` to set{help}", clean(path)));
-        };
-        Ok((at, knobs[at].value(value.trim())?))
-    };
-    text.split(',').map(one).collect()
 }
 
 #[cfg(test)]
@@ -173,41 +124,10 @@ mod tests {
     }
 
     #[test]
-    fn values_are_read_in_any_unit_that_fits() {
-        let all =
-            [knob("fr.Fs", "N·m", 0.42, (0.0, 1.0)), knob("Ti", "s", 0.2, (0.0, 9.0)), knob("on", "", 1.0, (0.0, 1.0))];
-        assert_eq!(set("fr.Fs = 310 mN·m", &all), Ok(vec![(0, 0.31)]));
-        assert_eq!(set("Ti=20 ms , fr.Fs = 0, on = false", &all), Ok(vec![(1, 0.02), (0, 0.0), (2, 0.0)]));
-        let tuned = [knob("Ti", "s", 0.2, (0.0, 9.0)).tuned((0.1, 0.5))];
-        assert_eq!(set("Ti = 500 ms", &tuned), Ok(vec![(0, 0.5)]));
-        assert_eq!(ends(0.2, tuned[0].range), Ends { from: 0.1, to: 0.5, logarithmic: false });
-        let refused = set("Ti = 0.6 s", &tuned).unwrap_err();
-        assert_eq!(refused, "E0502: `Ti` is tuned from 0.1 s to 0.5 s, not to 0.6 s");
-        let endless = [knob("vd", "m/s", f64::INFINITY, (0.0, f64::INFINITY))];
-        assert_eq!(set("vd = inf", &endless), Ok(vec![(0, f64::INFINITY)]));
-        assert_eq!(set("vd = 3 mm/s", &endless), Ok(vec![(0, 0.003)]));
-        for (text, why) in [
-            ("Ti = inf", "does not begin with a number"),
-            ("fr.Fs = 0.3", "`fr.Fs` is"),
-            ("fr.Fs = 0.3 s", "type it as in 0.42 N·m"),
-            ("fr.Fx = 0.3 N·m", "did you mean `fr.Fs`?"),
-            ("fr.Fs 0.3 N·m", "write it as PATH = VALUE"),
-            ("Ti = 1 s, fr.Fs = x", "does not begin with a number"),
-            ("on = 2", "true or false"),
-            ("", "sets nothing"),
-        ] {
-            let found = set(text, &all);
-            assert!(found.as_ref().is_err_and(|found| found.contains(why)), "{text}: {found:?}");
-        }
-    }
-
-    #[test]
-    fn what_is_shown_is_read_back_to_the_same_value() {
-        let knob = knob("fr.Fs", "mN", 0.0, (-1e9, 1e9));
-        for i in -300..300 {
-            let si = f64::from(i) * 1.37e-5;
-            let again = knob.value(&knob.text(si)).unwrap();
-            assert!((again - si).abs() <= 1e-8 * si.abs(), "{si} {again}");
-        }
+    fn tune_narrows_the_ends() {
+        let tuned = knob("Ti", "s", 0.2, (0.0, 9.0)).tuned((0.1, 0.5));
+        assert_eq!(ends(0.2, tuned.range), Ends { from: 0.1, to: 0.5, logarithmic: false });
+        let open = knob("Ti", "s", 0.2, (0.0, 9.0)).tuned((f64::NEG_INFINITY, f64::INFINITY));
+        assert_eq!(open, knob("Ti", "s", 0.2, (0.0, 9.0)));
     }
 }

@@ -1,27 +1,51 @@
 //! A rig that runs, with its operator's commands: what its process tells, and its log as a recording that grows.
 //!
-//! In: lines of the rig's process (see `commands/beside.rs`), and the recording once its log has begun. Out: a subject
-//! whose words become lines to that process. Waits for no answer: an answer becomes part of the state, so a viewer whose
-//! set is being checked can still stop the rig.
+//! In: lines of the rig's process, and the recording once its log has begun. Out: a subject whose words become lines to
+//! that process. Waits for no answer: an answer becomes part of the state, so a viewer whose set is being checked can
+//! still stop the rig.
+//!
+//! ```text
+//! from the rig      stage NEXT WORDS      NEXT: `enable`, `arm`, or `-` where no command is awaited
+//!                   now NS                the time of its monotonic clock, several times a second
+//!                   ok NUMBER             over WORDS
+//!                   refused NUMBER WORDS  problem WORDS
+//! to the rig        NUMBER COMMAND        as at the prompt
+//!                   NUMBER @NS COMMAND    where the rig tells its time: the last one that came
+//! ```
 
-use super::knob::Knob;
-use super::recording::{Played, Recording};
+use crate::frame::Frame;
+use crate::knob::Knob;
+use crate::line::View;
+use crate::recording::{Played, Recording};
+use crate::server::Bell;
+use crate::subject::Subject;
+use crate::words::clean;
 use abi::live::{Live, Tunable};
 use abi::{Instance, Slot};
-use panel::frame::Frame;
-use panel::line::View;
-use panel::server::Bell;
-use panel::subject::Subject;
-use panel::words::clean;
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
 use std::io::Write;
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
+use std::time::{Duration, Instant};
 
 /// Age of the picture from which a command is refused, s: a click that waited in a dead link must not arm a rig.
 const OLD: f64 = 1.0;
 /// Commands that wait for their answer; the oldest is forgotten.
 const OPEN: usize = 64;
+
+/// Time for which the panel of a rig that has ended waits for a page.
+const REMAINS: Duration = Duration::from_secs(5);
+
+/// Returns once nobody has looked for a while: a page that is loaded again has no connection for a moment.
+pub fn remain(bell: &Bell) {
+    let mut alone = Instant::now();
+    while alone.elapsed() < REMAINS {
+        std::thread::sleep(Duration::from_millis(100));
+        if bell.viewers() > 0 {
+            alone = Instant::now();
+        }
+    }
+}
 
 /// What the rig's process has told.
 struct Inner {
@@ -32,6 +56,8 @@ struct Inner {
     /// Commands without an answer, by number.
     open: BTreeMap<u64, String>,
     last: u64,
+    /// The last time that the process told, by its monotonic clock in ns: each command names it.
+    now: Option<u64>,
     /// The last answer, and its number.
     answer: Option<(u64, String, Result<(), String>)>,
     changes: u64,
@@ -68,6 +94,7 @@ impl Operated {
             problem: None,
             open: BTreeMap::new(),
             last: 0,
+            now: None,
             answer: None,
             changes: 1,
         };
@@ -109,6 +136,10 @@ impl Operated {
                 (inner.over, inner.next) = (Some(rest.into()), "-".into());
             }
             "problem" => inner.problem = Some(rest.into()),
+            "now" => {
+                inner.now = rest.parse().ok();
+                return;
+            }
             "ok" | "refused" => {
                 let (number, why) = rest.split_once(' ').unwrap_or((rest, ""));
                 let Ok(number) = number.parse() else { return };
@@ -128,10 +159,10 @@ impl Operated {
         self.inner().over.is_some()
     }
 
-    /// The rig's process is there no longer.
-    pub fn left(&self) {
+    /// Nothing more can be heard of the rig. `why`: if it has not told how it ended.
+    pub fn left(&self, why: &str) {
         if !self.is_over() {
-            self.told("over the process of the rig was killed");
+            self.told(&format!("over {why}"));
         }
     }
 
@@ -227,7 +258,7 @@ impl Subject for Operated {
                 return Err(format!("it was given before a picture that is {age:.1} s old: look, and give it again"));
             }
         }
-        let number = {
+        let (number, now) = {
             let mut inner = self.inner();
             inner.last += 1;
             let number = inner.last;
@@ -235,9 +266,10 @@ impl Subject for Operated {
             if inner.open.len() > OPEN {
                 inner.open.pop_first();
             }
-            number
+            (number, inner.now.filter(|_| !stops))
         };
-        self.say_line(&format!("{number} {words}"))?;
+        let stamp = now.map_or(String::new(), |ns| format!("@{ns} "));
+        self.say_line(&format!("{number} {stamp}{words}"))?;
         Ok(number.to_string())
     }
 }
@@ -308,7 +340,7 @@ mod tests {
 
     #[test]
     fn answers_and_the_end_are_part_of_the_state() {
-        let (operated, _) = open();
+        let (operated, lines) = open();
         operated.told("stage enable waiting to be enabled");
         assert_eq!(operated.state().1["next"], "enable");
         operated.say("@0 enable").unwrap();
@@ -322,10 +354,15 @@ mod tests {
             operated.told(line);
             assert_eq!(operated.state().0, after, "{line}");
         }
+        // A command names the time that the process told last, a stop none.
+        operated.told("now 123");
+        operated.say("@0 enable").unwrap();
+        operated.say("stop").unwrap();
+        assert!(String::from_utf8(lines.0.lock().unwrap().clone()).unwrap().ends_with("2 @123 enable\n3 stop\n"));
         operated.told("over stopped: enabling switch released");
         assert!(operated.say("@0 arm").is_err_and(|why| why.contains("enabling switch released")));
         assert!(operated.say("stop").is_ok());
-        operated.left();
+        operated.left("lost");
         assert_eq!(operated.state().1["over"], "stopped: enabling switch released");
     }
 }

@@ -3,17 +3,17 @@
 //! In: the messages of a log, one after the other; more may come while it is shown. Out: curves thinned from their
 //! extremes at every scale, in bounded memory; events; a histogram of how late the cycles began.
 
-use super::sheet::{Sheet, Signal};
+use crate::frame::{Block, COLUMNS, Frame, PATH};
+use crate::history::History;
+use crate::line::{View, Window};
+use crate::sheet::{Sheet, Signal};
+use crate::subject::Subject;
+use crate::thin;
+use crate::words::clean;
 use abi::format;
 use abi::rig::{Kind, Rig, SignalKind};
 use abi::unit::{Dimension, Unit};
 use abi::{Description, Slot};
-use panel::frame::{Block, COLUMNS, Frame, PATH};
-use panel::history::History;
-use panel::line::{View, Window};
-use panel::subject::Subject;
-use panel::thin;
-use panel::words::clean;
 use runtime::hil::control::{Control, Reading, Source};
 use runtime::hil::trace::{self, Cycle, Shape};
 use runtime::hil::words;
