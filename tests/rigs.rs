@@ -72,8 +72,12 @@ fn the_example_becomes_two_programs_and_a_plan() {
     assert_eq!(stops, ["overspeed", "enabling switch released"]);
     assert_eq!(
         rig.record.iter().map(|series| series.label.as_str()).collect::<Vec<_>>(),
-        ["body.x", "body.v", "fr.F", "pid.u", "shaft.torque"]
+        ["body.x", "body.v", "fr.F", "pid.u", "shaft.torque", "r"]
     );
+    // What is recorded already is not recorded again.
+    let plots: Vec<(&[usize], Option<usize>)> =
+        rig.plots.iter().map(|plot| (plot.series.as_slice(), plot.against)).collect();
+    assert_eq!(plots, [(&[0, 5][..], None), (&[1][..], None), (&[2, 3][..], None), (&[2][..], Some(1))]);
 
     // The part alone: the torques that drives apply move the shaft that encoders measure.
     let of = |node: usize, what: SignalKind| Signal { node, what };

@@ -6,6 +6,10 @@ import { Knobs } from './knobs.js';
 
 /** Seconds that are shown of what still grows. */
 const LAST = 20;
+/** How far the picture is behind the newest data, s: these come ten times a second, and the picture moves evenly. */
+const BEHIND = 0.25;
+/** Time between two pictures of what moves, ms. */
+const EACH = 33;
 
 const element = (/** @type {string} */ id) => /** @type {HTMLElement} */ (document.getElementById(id));
 const input = (/** @type {string} */ id) => /** @type {HTMLInputElement} */ (document.getElementById(id));
@@ -19,6 +23,8 @@ let newest = null;
 let before = LAST;
 /** The end of the data in the latest frame, s. */
 let end = 0;
+/** The right edge of the moving picture, s, at an instant, ms. */
+let edge = 0, edgeAt = 0, connected = false;
 /** @type {{ plot: Plot, canvas: any, curves: Map<number, any> }[]} */
 let plots = [];
 let /** @type {Knobs | null} */ knobs = null;
@@ -27,7 +33,17 @@ let /** @type {number | null} */ pointer = null;
 let cursors = null;
 /** Frames that wait to be drawn. @type {ArrayBuffer[]} */
 let frames = [];
+const calm = matchMedia('(prefers-reduced-motion: reduce)');
 let dirty = false, asked = false, told = 0;
+/** Measures of curves between the cursors, as the panel has computed them from all points. @type {Map<number, (number | null)[]>} */
+const measured = new Map();
+/** What they were asked for, and when. */
+let measuredFor = '', measuredAt = 0;
+/** Frames with curves so far. */
+let fresh = 0;
+/** A rule that moves the window. @type {{ curve: number, way: string, level: number, mode: string, place: number, after: number, asked: number, at: number | null, since: number } | null} */
+let trigger = null;
+let questions = 0;
 /** What to do with refusals, by the number of the line. @type {Map<number, (why: string) => void>} */
 const refusals = new Map();
 
@@ -38,6 +54,11 @@ const link = saved ? embedded(JSON.parse(saved.textContent ?? '{}'), message) : 
 function message(what) {
   if (what.kind === 'hello') begin(what.is);
   if (what.kind === 'state') { state = what.is; show(); }
+  if (what.kind === 'measures') {
+    what.curves.forEach((/** @type {number} */ curve, /** @type {number} */ i) => measured.set(curve, what.measures[i]));
+    wake();
+  }
+  if (what.kind === 'found' && what.number === trigger?.asked) found(what.t);
   if (what.kind === 'answer') {
     const refuse = refusals.get(what.number);
     refusals.delete(what.number);
@@ -46,8 +67,21 @@ function message(what) {
   }
 }
 
+/** The right edge of the moving picture now, s. */
+function edgeNow() {
+  return Math.min(end, edge + (performance.now() - edgeAt) / 1000);
+}
+
+/** Newer data have come: the edge keeps its pace, and is drawn towards them. */
+function pace() {
+  const goal = end - BEHIND, now = edgeNow(), off = goal - now;
+  edge = calm.matches ? end : Math.abs(off) > 1 ? goal : now + 0.1 * off;
+  edgeAt = performance.now();
+}
+
 /** @param {string} why */
 function lost(why) {
+  connected = false;
   sentence('old', why);
   document.body.classList.add('lost');
 }
@@ -115,9 +149,12 @@ function begin(/** @type {any} */ is) {
   if (frames.length) link.send(`ack ${new DataView(frames[frames.length - 1]).getUint32(0, true)}`);
   frames = [];
   hello = is;
+  measured.clear();
+  if (trigger) toggleTrigger();
   window_ = null;
   newest = hello.grows ? LAST : null;
-  end = hello.to;
+  end = edge = hello.to;
+  edgeAt = performance.now();
   element('title').textContent = hello.title;
   const choices = element('choices');
   choices.setAttribute('aria-label', words.experiments);
@@ -136,12 +173,16 @@ function begin(/** @type {any} */ is) {
   });
   plots.filter(one => one.plot.plane).forEach(one => { one.plot.title = hello.signals[one.canvas.against].unit; });
   plots.forEach(names);
+  watcher.disconnect();
+  seen.clear();
+  plots.forEach(one => watcher.observe(one.plot.root));
   const unit = element('knobs');
   unit.hidden = hello.knobs.length === 0 || !!saved;
   const rig = hello.kind === 'rig';
   knobs = unit.hidden ? null : new Knobs(element('rows'), hello.knobs, rig ? command : say, rig);
   for (const id of ['undo', 'text', 'kept', 'copy']) element(id).hidden = rig;
   element('stages').hidden = !rig;
+  element('marks').hidden = !rig || !!saved;
   element('stop').hidden = !rig || !!saved;
   if (knobs) knobs.onstaged = () => {
     const n = knobs?.staged.size ?? 0;
@@ -194,7 +235,7 @@ function look(canvas, curve) {
   const { signal, case: at, layer } = parts(curve), several = hello.cases.length > 1;
   const order = canvas.signals.indexOf(signal);
   const base = layer === baseLayer();
-  if (!base && layer === 0) return { colour: '--ghost', dash: [5, 4], ghost: true };
+  if (!base && (layer === 0 || hello.kind !== 'what if')) return { colour: '--ghost', dash: [5, 4], ghost: true };
   const own = several ? COLOURS[at % 4] : COLOURS[order % 4];
   const dash = several ? DASHES[(order + Math.floor(at / 4)) % 4] : DASHES[Math.floor(order / 4) % 4];
   return { colour: own, dash: base ? dash : layer === 2 ? [9, 4] : [3, 3], ghost: !base };
@@ -217,7 +258,8 @@ function names(one) {
     const { label, unit } = hello.signals[entry.signal];
     const over = canvas.against === null ? label : words.plane(label, hello.signals[canvas.against].label);
     const name = several && entry.label ? `${over}, ${entry.label}` : over;
-    item.append(line, `${name} `, value, unit ? ` ${unit}` : '');
+    const rms = document.createElement('small');
+    item.append(line, `${name} `, value, unit ? ` ${unit}` : '', rms);
     item.dataset.curve = String(curve);
     const style = look(canvas, curve);
     requestAnimationFrame(() => sample(line, style.colour, style.dash));
@@ -232,9 +274,11 @@ function all() {
 
 /** The window that is shown. @returns {[number, number]} */
 function span() {
-  const [from, to] = all();
+  const [from, last] = all();
+  if (!newest) return window_ ?? [from, last];
+  const to = state?.grows ? edgeNow() : last;
   // What is shorter fills the picture.
-  return newest ? [Math.min(Math.max(from, to - newest), to - 1e-3), to] : window_ ?? [from, to];
+  return [Math.min(Math.max(from, to - newest), to - 1e-3), to];
 }
 
 /** Asks for the curves of all canvases, once they have their size. */
@@ -316,6 +360,7 @@ function events() {
   const happened = state?.events ?? [], late = state?.late;
   element('events').hidden = hello.kind === 'what if';
   if (JSON.stringify(happened) !== listed) list(happened);
+  standing();
   element('late').hidden = !late;
   if (late) {
     element('late-name').textContent = words.late;
@@ -323,6 +368,45 @@ function events() {
     element('late-words').textContent = words.lateWords(late);
   }
 }
+/** Drives with their lights, commands within their limits. */
+function standing() {
+  const { drives = [], commands = [] } = state?.standing ?? {}, place = element('drives');
+  element('standing').hidden = drives.length + commands.length === 0;
+  element('standing-name').textContent = words.drives;
+  const energy = element('energy');
+  energy.hidden = !state?.energy;
+  if (state?.energy) energy.textContent = words.energy(state.energy);
+  energy.className = state?.energy && (state.energy.share > 1 || state.energy.unpredicted > 0) ? 'light bad' : '';
+  if (place.children.length !== drives.length + commands.length) {
+    place.replaceChildren(...[...drives, ...commands].map((_, i) => {
+      const item = document.createElement('li'), text = document.createElement('span');
+      item.append(text);
+      if (i >= drives.length) {
+        const meter = document.createElement('div');
+        meter.className = 'meter';
+        meter.setAttribute('role', 'meter');
+        meter.append(document.createElement('i'));
+        item.append(meter);
+      }
+      return item;
+    }));
+  }
+  [...place.children].forEach((item, i) => {
+    const text = item.querySelector('span'), drive = drives[i], command = commands[i - drives.length];
+    const told = drive ? `${drive.name}: ${drive.words}` : words.of(command);
+    item.className = drive ? `light ${drive.kind}` : '';
+    if (text && text.textContent !== told) text.textContent = told;
+    const meter = /** @type {HTMLElement | null} */ (item.querySelector('.meter'));
+    if (meter) {
+      const part = (/** @type {number} */ value) => 100 * Math.min(1, Math.max(0, (value - command.low) / (command.high - command.low)));
+      const [zero, now] = [part(0), part(command.value)], bar = /** @type {HTMLElement} */ (meter.firstElementChild);
+      [bar.style.left, bar.style.width] = [`${Math.min(zero, now)}%`, `max(2px, ${Math.abs(now - zero)}%)`];
+      meter.setAttribute('aria-label', command.name);
+      for (const [name, value] of [['min', command.low], ['max', command.high], ['now', command.value]]) meter.setAttribute(`aria-value${name}`, String(value));
+    }
+  });
+}
+
 /** The answer that was shown last. */
 let answered = 0;
 /** The events that are listed, as text. */
@@ -348,6 +432,7 @@ function list(happened) {
 /** Shows what the panel says of itself. */
 function show() {
   if (!hello || !state) return;
+  connected = true;
   document.body.classList.remove('lost');
   if (hello.kind !== 'rig' || state.problem) problem(state.problem ?? null);
   if (hello.kind !== 'what if') {
@@ -398,6 +483,16 @@ function show() {
 /** What the ghosts are. */
 function legend() {
   const place = element('legend');
+  if (hello.kind !== 'what if') {
+    const there = state.layers[1];
+    if (place.childElementCount === Number(there)) return;
+    const item = document.createElement('span'), line = document.createElement('canvas');
+    line.className = 'sample';
+    line.setAttribute('aria-hidden', 'true');
+    item.append(line, words.twin);
+    place.replaceChildren(...there ? [item] : []);
+    return void requestAnimationFrame(() => sample(line, '--ghost', [5, 4]));
+  }
   const shown = state.layers.map((/** @type {boolean} */ drawn, /** @type {number} */ layer) => ({ drawn, layer })).filter((/** @type {any} */ one) => one.drawn && words.drawn[one.layer] && hello.kind === 'what if');
   place.replaceChildren(...shown.map((/** @type {any} */ one) => {
     const item = document.createElement('span'), line = document.createElement('canvas');
@@ -425,8 +520,14 @@ function resize() {
   wake();
 }
 
+/** Canvases in the window of the browser. @type {Set<Element>} */
+const seen = new Set();
+const watcher = new IntersectionObserver(entries => {
+  for (const entry of entries) if (entry.isIntersecting) seen.add(entry.target); else seen.delete(entry.target);
+  wake();
+});
+let printing = false;
 let drawnAt = 0;
-const calm = matchMedia('(prefers-reduced-motion: reduce)');
 
 function draw() {
   dirty = false;
@@ -439,10 +540,14 @@ function draw() {
   drawnAt = now;
   if (!hello) return;
   let last = -1;
+  if (frames.length) fresh += 1;
   for (const buffer of frames) {
     const frame = decode(buffer, hello.period ?? 0);
     last = frame.number;
-    end = frame.newest;
+    if (frame.newest !== end) {
+      end = frame.newest;
+      pace();
+    }
     for (const curve of frame.curves) {
       const curves = plots[curve.view]?.curves;
       curves?.set(curve.curve, joined(curves.get(curve.curve), curve, span()[0]));
@@ -450,9 +555,12 @@ function draw() {
   }
   frames = [];
   if (!asked && !saved) ask();
-  if (state) plots.forEach(picture);
+  // What nobody sees is not drawn.
+  if (state) plots.filter(one => printing || seen.has(one.plot.root)).forEach(picture);
+  seek();
   if (cursors) measure();
   if (last >= 0) link.send(`ack ${last}`);
+  if (newest && state?.grows && connected && !calm.matches && !document.hidden) setTimeout(wake, EACH - 12);
   // The sentences for screen readers change at most twice a second, and once at the end.
   if (now - told > 500) tell(); else { clearTimeout(telling); telling = setTimeout(tell, 500); }
 }
@@ -471,13 +579,15 @@ function picture(one) {
   // The latest run on top.
   lines.sort((a, b) => Number(b.ghost) - Number(a.ghost));
   plot.draw(lines, plot.plane ? null : span());
-  if (!plot.plane) plot.drawMarks(pointer, state.events ?? [], cursorTimes() ?? []);
+  if (!plot.plane) plot.drawMarks(pointer, state.events ?? [], [...cursorTimes() ?? [], ...trigger?.at ? [trigger.at] : []]);
   for (const item of plot.names.children) {
     const own = /** @type {HTMLElement} */ (item), curve = one.curves.get(Number(own.dataset.curve)), value = own.querySelector('b');
     if (!curve || !value) continue;
     const at = plot.plane ? curve.y[curve.y.length - 1] : valueAt(curve, pointer ?? span()[1]);
     const text = number(at, 4);
     if (value.textContent !== text) value.textContent = text;
+    const rms = state.rms?.[Number(own.dataset.curve)], place = own.querySelector('small'), off = plot.plane || typeof rms !== 'number' ? '' : words.rms(rms);
+    if (place && place.textContent !== off) place.textContent = off;
   }
 }
 
@@ -511,23 +621,34 @@ function toggleCursors() {
   wake();
 }
 
-/** What lies between the cursors: extremes are those of all points, as every column keeps its own. */
+/** Asks for the measures of all points, now and then. @param {[number, number]} times @param {number[]} curves */
+function askMeasures(times, curves) {
+  const what = `${times} ${curves} ${fresh}`;
+  if (saved || what === measuredFor || curves.length === 0) return;
+  if (performance.now() - measuredAt < 250) return void setTimeout(wake, 250);
+  measuredFor = what;
+  measuredAt = performance.now();
+  for (let i = 0; i < curves.length; i += 16) link.send(`between ${questions += 1} ${times[0]} ${times[1]} ${curves.slice(i, i + 16).join(',')}`);
+}
+
+/** What lies between the cursors. Extremes are those of all points, as every column keeps its own. */
 function measure() {
   const times = cursorTimes(), made = element('cursors').querySelector('table');
-  if (!times || !made) return;
-  const [from, to] = times, fresh = document.createElement('table');
-  const head = fresh.createTHead().insertRow();
+  if (!times || !made || times[0] >= times[1]) return;
+  const [from, to] = times, table = document.createElement('table');
+  const head = table.createTHead().insertRow();
   for (const name of [words.between(from, to), ...words.measures]) {
     const cell = document.createElement('th');
     cell.scope = 'col';
     cell.textContent = name;
     head.append(cell);
   }
-  const body = fresh.createTBody();
+  const body = table.createTBody(), curves = [];
   for (const one of plots.filter(one => !one.plot.plane)) {
     for (const [curve, { x, y }] of one.curves) {
       const { signal, case: at, layer } = parts(curve);
       if (layer !== baseLayer()) continue;
+      curves.push(curve);
       const first = valueAt({ x, y }, from), last = valueAt({ x, y }, to);
       let low = Math.min(first, last), high = Math.max(first, last);
       for (let i = 0; i < x.length; i++) {
@@ -535,12 +656,114 @@ function measure() {
         if (y[i] < low) low = y[i];
         if (y[i] > high) high = y[i];
       }
-      const row = body.insertRow(), { label, unit } = hello.signals[signal];
-      row.insertCell().textContent = [label, hello.cases[at], unit && `in ${unit}`].filter(Boolean).join(' ');
-      for (const value of [last - first, low, high, high - low]) row.insertCell().textContent = number(value, 5);
+      const known = measured.get(curve), row = body.insertRow(), { label, unit } = hello.signals[signal];
+      const [min, max, mean, rms, peak, period] = known ?? [low, high, NaN, NaN, high - low, NaN];
+      const name = [label, hello.cases[at], unit && `in ${unit}`].filter(Boolean).join(' '), copy = button(name, () => {
+        void navigator.clipboard?.writeText(words.expect(label, `${number(peak ?? NaN, 5)} ${unit}`.trim(), from, to));
+      });
+      copy.setAttribute('aria-label', words.copyExpect(name));
+      row.insertCell().append(copy);
+      for (const value of [last - first, min, max, mean, rms, peak, period]) row.insertCell().textContent = number(value ?? NaN, 5);
     }
   }
-  made.replaceWith(fresh);
+  askMeasures(times, curves);
+  // What stands there stays where it is, so that the focus does: only its texts change.
+  const cells = (/** @type {HTMLElement} */ of) => [...of.querySelectorAll('th, td')], [before, after] = [cells(made), cells(table)];
+  if (before.length !== after.length) return made.replaceWith(table);
+  before.forEach((cell, i) => {
+    const [old, own] = [cell.querySelector('button'), after[i].querySelector('button')];
+    if (old && own) {
+      old.onclick = own.onclick;
+      if (old.textContent !== own.textContent) old.textContent = own.textContent;
+      old.setAttribute('aria-label', own.getAttribute('aria-label') ?? '');
+    } else if (cell.textContent !== after[i].textContent) cell.textContent = after[i].textContent;
+  });
+}
+
+/** A choice with a name. @param {string} name @param {[string, string][]} of @param {() => void} act */
+function choice(name, of, act) {
+  const made = document.createElement('select');
+  made.setAttribute('aria-label', name);
+  made.append(...of.map(([value, text]) => new Option(text, value)));
+  made.onchange = act;
+  return made;
+}
+
+function toggleTrigger() {
+  const place = element('trigger');
+  element('triggered').setAttribute('aria-pressed', String(!trigger));
+  place.hidden = !!trigger;
+  if (trigger) {
+    trigger = null;
+    return wake();
+  }
+  const shown = plots.filter(one => !one.plot.plane).flatMap(one => one.canvas.signals);
+  const name = (/** @type {number} */ signal) => `${hello.signals[signal].label} ${hello.signals[signal].unit && `in ${hello.signals[signal].unit}`}`.trim();
+  const level = document.createElement('input'), told = document.createElement('output');
+  const rule = () => {
+    const curve = baseLayer() * hello.cases.length * hello.signals.length + Number(signal.value);
+    const value = Number(level.value.replace('−', '-'));
+    const begin = hello.grows && state?.grows ? end : all()[0];
+    trigger = { curve, way: way.value, level: Number.isFinite(value) ? value : 0, mode: mode.value, place: Number(part.value), after: begin, asked: -1, at: null, since: begin };
+    told.textContent = words.waits;
+    wake();
+  };
+  const signal = choice(words.signal, shown.map(one => [String(one), name(one)]), rule), way = choice(words.way, words.ways, rule);
+  const mode = choice(words.mode, words.modes, rule), part = choice(words.place, words.places, rule);
+  mode.value = 'normal';
+  level.type = 'text';
+  level.value = '0';
+  level.setAttribute('aria-label', words.level);
+  level.onchange = rule;
+  place.setAttribute('aria-label', words.triggerOf);
+  place.replaceChildren(signal, way, level, mode, part, button(words.nextOne, () => {
+    if (!trigger) return;
+    trigger.after = trigger.at ?? trigger.after;
+    trigger.at = null;
+    trigger.asked = -1;
+    wake();
+  }), told);
+  rule();
+}
+
+/** Looks for the next crossing of the trigger in all points. */
+function seek() {
+  if (!trigger || trigger.asked >= 0 || saved) return;
+  const [from, to] = span();
+  // The one that is shown stays until its window is over.
+  if (trigger.at !== null && (trigger.mode === 'single' || !state?.grows || end < trigger.at + (to - from))) return;
+  if (trigger.at === null && trigger.since >= end && trigger.after >= end) return;
+  trigger.asked = questions += 1;
+  link.send(`find ${trigger.asked} ${trigger.curve} ${trigger.way} ${trigger.level} ${trigger.after}`);
+}
+
+/** @param {number | null} t */
+function found(t) {
+  if (!trigger) return;
+  const [from, to] = span(), width = to - from;
+  if (t === null) {
+    // Nothing yet: it is looked for again in what comes. `auto` goes on with the newest meanwhile.
+    trigger.since = end;
+    if (trigger.mode === 'auto' && state?.grows && end > (trigger.at ?? trigger.after) + width) now(width);
+    const own = trigger;
+    setTimeout(() => { own.asked = -1; wake(); }, 200);
+    return;
+  }
+  trigger.at = trigger.after = t;
+  trigger.asked = -1;
+  const told = element('trigger').querySelector('output');
+  if (told) told.textContent = words.foundAt(t);
+  window_ = [t - trigger.place * width, t + (1 - trigger.place) * width];
+  newest = null;
+  asked = false;
+  wake();
+}
+
+function mark() {
+  const place = input('word'), text = place.value.trim();
+  if (!text) return place.focus();
+  command(`mark ${text}`, problem);
+  place.value = '';
 }
 
 /** Sums up each canvas for those who cannot see it. */
@@ -632,7 +855,13 @@ function start() {
   measures.id = 'measure';
   shown.id = 'legend';
   shown.className = 'legend';
-  tools.append(button(words.whole, () => move(null)), button(words.newest, home), button(words.closer, () => zoom(0.5)), button(words.wider, () => zoom(2)), values, measures, shown);
+  const triggered = button(words.trigger, toggleTrigger, false);
+  triggered.id = 'triggered';
+  element('word-name').textContent = words.word;
+  element('mark').textContent = words.mark;
+  element('mark').onclick = mark;
+  input('word').onkeydown = event => { if (event.key === 'Enter') mark(); };
+  tools.append(button(words.whole, () => move(null)), button(words.newest, home), button(words.closer, () => zoom(0.5)), button(words.wider, () => zoom(2)), values, measures, ...saved ? [] : [triggered], shown);
   addEventListener('keydown', event => {
     const target = /** @type {HTMLElement} */ (event.target);
     if (event.key === 'Escape' && hello?.kind === 'rig') return stop();
@@ -641,7 +870,7 @@ function start() {
     if (event.key === ' ' && target.closest('button, input')) return;
     const [from, to] = span(), by = 0.2 * (to - from);
     const act = {
-      '+': () => zoom(0.5), '=': () => zoom(0.5), '-': () => zoom(2), Home: home, ' ': hold, t: toggleTable, c: toggleCursors, u: () => knobs?.undo(),
+      '+': () => zoom(0.5), '=': () => zoom(0.5), '-': () => zoom(2), Home: home, ' ': hold, t: toggleTable, c: toggleCursors, u: () => knobs?.undo(), m: () => { if (hello.kind === 'rig') input('word').focus(); },
       ArrowLeft: () => (window_ || newest) && move([from - by, to - by]), ArrowRight: () => window_ && move([from + by, to + by]),
     }[event.key];
     if (act) {
@@ -651,6 +880,7 @@ function start() {
   });
   new ResizeObserver(resize).observe(element('curves'));
   matchMedia('(prefers-color-scheme: dark)').addEventListener('change', () => { plots.forEach(names); if (state) legend(); resize(); wake(); });
-  addEventListener('beforeprint', resize);
+  addEventListener('beforeprint', () => { printing = true; resize(); draw(); });
+  addEventListener('afterprint', () => { printing = false; });
 }
 start();

@@ -12,6 +12,7 @@ use runtime::hil::trace;
 use runtime::record::blocks::End;
 use runtime::record::log::{Reader, Sections};
 use std::path::Path;
+use std::sync::Arc;
 use std::time::Duration;
 
 /// Polling interval of a log that grows: its writer appends to it ten times a second.
@@ -48,8 +49,22 @@ pub fn read_on(reader: &mut Reader, recording: &mut Recording) -> Result<u64, St
     Ok(added)
 }
 
+/// Longest dry run beside a recording, s.
+const TWIN: f64 = 60.0;
+
+/// Makes the dry run of a recording whose model has taken over, in a thread of its own.
+pub fn twin(played: &Arc<Played>, bell: &Bell) {
+    let Some(twin) = played.recording().wants_twin() else { return };
+    let (played, bell) = (played.clone(), bell.clone());
+    std::thread::spawn(move || {
+        let made = twin.run(TWIN);
+        played.recording().beside(made);
+        bell.ring();
+    });
+}
+
 /// Follows a log until it has ended. `more`: whether its writer may still append to it.
-pub fn follow(mut reader: Reader, played: &Played, more: &dyn Fn() -> bool, bell: &Bell) {
+pub fn follow(mut reader: Reader, played: &Arc<Played>, more: &dyn Fn() -> bool, bell: &Bell) {
     let mut grows = true;
     while grows {
         std::thread::sleep(LOOK);
@@ -66,6 +81,7 @@ pub fn follow(mut reader: Reader, played: &Played, more: &dyn Fn() -> bool, bell
             Err(why) => recording.end(why),
         }
         drop(recording);
+        twin(played, bell);
         bell.ring();
     }
 }

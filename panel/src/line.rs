@@ -9,6 +9,8 @@
 //!                                         `last SECONDS`: the newest, also while more comes
 //! path ID SIGNAL,SIGNAL FROM TO           the second over the first
 //! drop ID                                 of either
+//! between NUMBER FROM TO CURVE,…          what `expect` measures between two instants, s
+//! find NUMBER CURVE rises|falls VALUE FROM  when the curve first passes a value after that instant
 //! ack FRAME                               this frame is drawn
 //! NUMBER WORDS                            for the subject; answered under this number
 //! ```
@@ -19,6 +21,8 @@ pub const VIEWS: u16 = 32;
 pub const SIGNALS: usize = 64;
 /// Most columns of a view.
 pub const COLUMNS: u32 = 4096;
+/// Most curves that are measured at once.
+pub const MEASURED: usize = 16;
 /// Most bytes of a message.
 pub const LONGEST: usize = 4096;
 
@@ -57,6 +61,19 @@ pub struct View {
     pub columns: Option<u32>,
 }
 
+/// A curve that passes a value.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub struct Crossing {
+    /// The curve.
+    pub curve: u32,
+    /// From below, and not from above.
+    pub rises: bool,
+    /// The value, in the curve's unit.
+    pub level: f64,
+    /// After this instant, s.
+    pub after: f64,
+}
+
 /// A line.
 #[derive(Clone, PartialEq, Debug)]
 pub enum Line<'a> {
@@ -66,6 +83,10 @@ pub enum Line<'a> {
     View(View),
     /// End a view.
     Drop(u16),
+    /// Measures of curves from one instant to another, answered under this number.
+    Between(u32, f64, f64, Vec<u32>),
+    /// When a curve first passes a value after an instant, answered under this number.
+    Find(u32, Crossing),
     /// This frame is drawn.
     Ack(u32),
     /// Words for the subject.
@@ -101,12 +122,37 @@ pub fn read(text: &str) -> Result<Line<'_>, String> {
         }
         ("drop", [id]) => Ok(Line::Drop(number(id, "the number of a view")?)),
         ("ack", [frame]) => Ok(Line::Ack(number(frame, "the number of a frame")?)),
-        ("key" | "view" | "path" | "drop" | "ack", _) => Err(format!("`{word}` needs other words after it")),
+        ("between", [number, from, to, curves]) => {
+            let curves: Vec<u32> =
+                curves.split(',').map(|one| self::number(one, "a curve")).collect::<Result<_, _>>()?;
+            if curves.len() > MEASURED {
+                return Err(format!("at most {MEASURED} curves are measured at once"));
+            }
+            let (from, to) = (instant(from)?, instant(to)?);
+            if from >= to {
+                return Err(format!("a window goes from one time to a later one, not from {from} to {to}"));
+            }
+            Ok(Line::Between(self::number(number, "a number")?, from, to, curves))
+        }
+        ("find", [number, curve, way @ ("rises" | "falls"), level, after]) => {
+            let (curve, rises) = (self::number(curve, "a curve")?, *way == "rises");
+            let crossing = Crossing { curve, rises, level: instant(level)?, after: instant(after)? };
+            Ok(Line::Find(self::number(number, "a number")?, crossing))
+        }
+        ("key" | "view" | "path" | "drop" | "ack" | "between" | "find", _) => {
+            Err(format!("`{word}` needs other words after it"))
+        }
         (number, [_, ..]) if number.bytes().all(|byte| byte.is_ascii_digit()) => {
             Ok(Line::Say(self::number(number, "a number")?, rest))
         }
-        _ => Err("a line begins with `view`, `path`, `drop`, `ack`, or a number".into()),
+        _ => Err("a line begins with `view`, `path`, `drop`, `between`, `find`, `ack`, or a number".into()),
     }
+}
+
+/// A finite number.
+fn instant(text: &str) -> Result<f64, String> {
+    let value: f64 = number(text, "a number")?;
+    if value.is_finite() { Ok(value) } else { Err(format!("{value} is no finite number")) }
 }
 
 fn number<T: std::str::FromStr>(text: &str, what: &str) -> Result<T, String> {
@@ -157,6 +203,9 @@ mod tests {
         assert_eq!(read("path 5 1,2 0 10"), Ok(view(5, &[1, 2], Window::Span(0.0, 10.0), None)));
         assert_eq!(read("view 1 2 last 24 600"), Ok(view(1, &[2], Window::Last(24.0), Some(600))));
         assert_eq!(read("ack 17"), Ok(Line::Ack(17)));
+        assert_eq!(read("between 4 1.5 2e1 0,3"), Ok(Line::Between(4, 1.5, 20.0, vec![0, 3])));
+        let crossing = Crossing { curve: 2, rises: false, level: -0.5, after: 3.0 };
+        assert_eq!(read("find 9 2 falls -0.5 3"), Ok(Line::Find(9, crossing)));
         assert_eq!(read("drop 3\n"), Ok(Line::Drop(3)));
         assert_eq!(read("12 set fr.Fs = 0.31 N, m = 2 kg"), Ok(Line::Say(12, "set fr.Fs = 0.31 N, m = 2 kg")));
     }
@@ -184,6 +233,11 @@ mod tests {
             ("view 1 0 last inf 10", "longer than 0 s"),
             ("view 1 0 last 10", "a window is `all`"),
             ("path 1 0 all", "a path has two signals"),
+            ("between 1 2 1 0", "from one time to a later one"),
+            ("between 1 0 inf 0", "no finite number"),
+            ("between 1 0 1 0,1,2,3,4,5,6,7,8,9,10,11,12,13,14,15,16", "at most 16 curves"),
+            ("find 1 0 up 1 0", "`find` needs other words"),
+            ("find 1 0 rises nan 0", "no finite number"),
             ("path 1 0,1,2 all", "a path has two signals"),
             ("ack -1", "`-1` is not the number of a frame"),
             ("drop \u{202e}", "`\\u{202e}` is not the number of a view"),
@@ -206,6 +260,10 @@ mod tests {
             "path",
             "drop",
             "ack",
+            "between",
+            "find",
+            "rises",
+            "falls",
             "all",
             "last",
             "0",
@@ -237,7 +295,7 @@ mod tests {
                 state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
                 (state >> 33) as usize % n
             };
-            let first = WORDS[below(8)];
+            let first = WORDS[below(10)];
             let more: Vec<&str> = (0..below(6)).map(|_| WORDS[below(WORDS.len())]).collect();
             let line = format!("{first} {}", more.join(" "));
             let again = match read(&line) {
@@ -256,6 +314,14 @@ mod tests {
                         Some(columns) => format!("view {id} {signals} {window} {columns}"),
                         None => format!("path {id} {signals} {window}"),
                     }
+                }
+                Ok(Line::Between(number, from, to, curves)) => {
+                    assert!(from < to && curves.len() <= MEASURED, "seed {seed}: {line}");
+                    let curves: Vec<String> = curves.iter().map(u32::to_string).collect();
+                    format!("between {number} {from} {to} {}", curves.join(","))
+                }
+                Ok(Line::Find(number, Crossing { curve, rises, level, after })) => {
+                    format!("find {number} {curve} {} {level} {after}", if rises { "rises" } else { "falls" })
                 }
                 Ok(Line::Drop(id)) => format!("drop {id}"),
                 Ok(Line::Ack(frame)) => format!("ack {frame}"),

@@ -9,11 +9,12 @@ use crate::line::{View, Window};
 use crate::sheet::{Sheet, Signal};
 use crate::subject::Subject;
 use crate::thin;
+use crate::twin::{Difference, Twin};
 use crate::words::clean;
 use abi::format;
 use abi::rig::{Kind, Rig, SignalKind};
 use abi::unit::{Dimension, Unit};
-use abi::{Description, Slot};
+use abi::{Description, Instance, Slot};
 use runtime::hil::control::{Control, Reading, Source};
 use runtime::hil::trace::{self, Cycle, Shape};
 use runtime::hil::words;
@@ -70,6 +71,16 @@ pub struct Recording {
     told: (u64, Instant),
     /// Parameters that were set while it ran, SI.
     set: BTreeMap<Slot, f64>,
+    /// Both programs of the rig at their start, until the dry run is made.
+    programs: Option<(Instance, Instance)>,
+    /// When the model took over, in cycles, and what was set before.
+    armed: Option<(u64, Vec<(Slot, f64)>)>,
+    twin: Vec<Vec<(f64, f64)>>,
+    differences: Vec<Difference>,
+    /// Where the data ended when the dry run came.
+    twin_from: u64,
+    /// Permitted commands and status words of the last cycle.
+    last: (Vec<f64>, Vec<u16>),
 }
 
 /// The SI unit of a signal of a node.
@@ -89,7 +100,9 @@ fn unit_of(rig: &Rig, signal: abi::rig::Signal) -> Unit {
 
 impl Recording {
     /// An empty recording of a rig. `keep`: bytes of its curves in memory.
-    pub fn new(name: &str, rig: &Rig, description: &Description, control: &Control, keep: u64) -> Recording {
+    /// `programs`: of control and of the part that the drives replace, at their start.
+    pub fn new(name: &str, rig: &Rig, programs: (&Instance, &Instance), control: &Control, keep: u64) -> Recording {
+        let description = programs.0.description();
         let signals: Vec<abi::rig::Signal> = control.signals().collect();
         let mut sheet = Sheet::default();
         let recorded: Vec<usize> = rig.record.iter().map(|series| sheet.signal(Signal::of(series))).collect();
@@ -123,7 +136,7 @@ impl Recording {
         Recording {
             name: name.into(),
             rig: rig.clone(),
-            description: description.clone(),
+            description: (**description).clone(),
             shape: Shape::of(rig, control),
             signals,
             sheet,
@@ -141,6 +154,12 @@ impl Recording {
             first: None,
             told: (1, Instant::now()),
             set: BTreeMap::new(),
+            programs: Some((programs.0.clone(), programs.1.clone())),
+            armed: None,
+            twin: Vec::new(),
+            differences: Vec::new(),
+            twin_from: 0,
+            last: (Vec::new(), Vec::new()),
         }
     }
 
@@ -157,6 +176,13 @@ impl Recording {
             trace::CYCLE => match Cycle::read(self.shape, &message.words) {
                 Some(cycle) => {
                     self.cycle(&cycle);
+                    true
+                }
+                None => false,
+            },
+            trace::MARK => match trace::read_mark(&message.words) {
+                Some((due_ns, words)) => {
+                    self.event(due_ns / self.rig.period_ns, "mark", words);
                     true
                 }
                 None => false,
@@ -189,6 +215,50 @@ impl Recording {
     /// The value of a parameter that was set while it ran, SI.
     pub fn set_value(&self, slot: Slot) -> Option<f64> {
         self.set.get(&slot).copied()
+    }
+
+    /// The dry run that is to be made, once: when the model has taken over.
+    pub fn wants_twin(&mut self) -> Option<Twin> {
+        let (at, set) = self.armed.as_ref()?;
+        let (control, plant) = self.programs.take()?;
+        Some(Twin { rig: self.rig.clone(), control, plant, set: set.clone(), at: self.seconds(*at) })
+    }
+
+    /// Shows a dry run beside the recorded quantities.
+    pub fn beside(&mut self, twin: Vec<Vec<(f64, f64)>>) {
+        self.differences = vec![Difference::default(); twin.len()];
+        let all = self.history.cycles();
+        for (signal, (difference, twin)) in self.differences.iter_mut().zip(&twin).enumerate() {
+            for cycle in self.armed.as_ref().map_or(all.end, |armed| armed.0.max(all.start))..all.end {
+                let t = cycle as f64 * self.rig.period_ns as f64 * 1e-9;
+                difference.see(twin, t, self.history.value(signal, cycle));
+            }
+        }
+        (self.twin, self.twin_from) = (twin, all.end);
+        self.tell();
+    }
+
+    /// How the drives and commands stand, for the page.
+    fn standing(&self) -> Value {
+        let moving = self.rig.nodes.iter().filter(|node| node.moves);
+        let drives = moving.zip(&self.last.1).map(|(node, word)| {
+            let (kind, words) = condition(*word);
+            json!({ "name": clean(&node.name), "kind": kind, "words": words })
+        });
+        let commands = self
+            .rig
+            .outputs
+            .iter()
+            .zip(&self.last.0)
+            .filter(|(output, _)| output.low.is_finite() && output.high.is_finite() && output.low < output.high);
+        let commands = commands.map(|(output, value)| {
+            let unit = unit_of(&self.rig, output.signal);
+            json!({
+                "name": clean(&words::signal(&self.rig, output.signal)),
+                "value": value, "low": output.low, "high": output.high, "unit": unit.text,
+            })
+        });
+        json!({ "drives": drives.collect::<Vec<_>>(), "commands": commands.collect::<Vec<_>>() })
     }
 
     /// The number of [`Recording::state`].
@@ -240,6 +310,15 @@ impl Recording {
             *place = value;
         }
         self.history.push(at, &self.row);
+        let t = self.seconds(at);
+        for ((difference, twin), value) in self.differences.iter_mut().zip(&self.twin).zip(&self.row) {
+            difference.see(twin, t, *value);
+        }
+        self.last.0.clone_from(&cycle.permitted);
+        self.last.1.clone_from(&cycle.statuses);
+        if cycle.arms && cycle.source == Source::Model && self.armed.is_none() {
+            self.armed = Some((at, self.set.iter().map(|(slot, si)| (*slot, *si)).collect()));
+        }
         if cycle.arms {
             let whose = match cycle.source {
                 Source::Model => "armed: the model runs",
@@ -349,6 +428,20 @@ impl Recording {
     }
 }
 
+/// The state of a drive with this status word, as kind and words (CiA 402, table 30); a drive without status words has 0.
+fn condition(word: u16) -> (&'static str, &'static str) {
+    match (word & 0x4f, word & 0x6f) {
+        (0x0f, _) => ("bad", "reacts to a fault"),
+        (0x08, _) => ("bad", "fault"),
+        (0x40, _) => ("old", "switch on disabled"),
+        (_, 0x21) => ("old", "ready to switch on"),
+        (_, 0x23) => ("old", "switched on"),
+        (_, 0x27) => ("good", "follows commands"),
+        (_, 0x07) => ("bad", "quick stop"),
+        _ => ("old", "no status"),
+    }
+}
+
 /// The lower edge of a bar, µs.
 fn edge(bar: usize) -> f64 {
     #[allow(clippy::disallowed_methods, reason = "a picture")]
@@ -397,8 +490,10 @@ impl Recording {
         json!({
             "values": [],
             "texts": [],
-            "layers": [true],
+            "layers": [true, !self.twin.is_empty()],
             "kept": [],
+            "rms": self.differences.iter().map(Difference::rms).collect::<Vec<_>>(),
+            "standing": self.standing(),
             "words": clean(&words),
             "set": "",
             "from": from,
@@ -414,6 +509,42 @@ impl Recording {
                 "missed": self.missed,
             },
         })
+    }
+
+    /// The curves of the dry run: once, and again for another window.
+    fn twin_blocks(&self, view: &View, columns: usize, since: Option<u64>, frame: &mut Frame) {
+        if since.is_some_and(|since| since > self.twin_from) {
+            return;
+        }
+        for signal in &view.signals {
+            let Some(points) = self.twin.get(*signal as usize).filter(|points| !points.is_empty()) else { continue };
+            let (begin, end) = (points[0].0, points[points.len() - 1].0);
+            let (from, to, columns) = match view.window {
+                Window::All => (begin, end, columns),
+                Window::Span(from, to) => (from, to, columns),
+                // All of it, as fine as this window shows it: it comes into the window with time.
+                Window::Last(seconds) => {
+                    (begin, end, ((end - begin) / seconds * columns as f64).ceil().clamp(1.0, 1e4) as usize)
+                }
+            };
+            let points = thin::window(points, from, to, columns);
+            let first = points.first().map_or(0.0, |point| point.0);
+            let curve = self.sheet.signals.len() as u32 + signal;
+            frame.path(Block { kind: PATH, view: view.id, curve, cycles: 0, first }, &points);
+        }
+    }
+
+    /// Points of a curve: see [`Subject::points`].
+    fn points(&self, curve: u32, from: f64, each: &mut dyn FnMut(f64, f64) -> bool) {
+        let (all, signal) = (self.history.cycles(), curve as usize);
+        if signal >= self.sheet.signals.len() {
+            return;
+        }
+        for cycle in self.cycle_at(from).saturating_sub(1).max(all.start)..all.end {
+            if !each(self.seconds(cycle), self.history.value(signal, cycle)) {
+                return;
+            }
+        }
     }
 
     fn blocks(&self, view: &View, since: Option<u64>, frame: &mut Frame) {
@@ -433,6 +564,7 @@ impl Recording {
                 let block = Block { kind: COLUMNS, view: view.id, curve: *signal, cycles, first: first as f64 };
                 frame.columns(block, &pairs);
             }
+            self.twin_blocks(view, columns as usize, since, frame);
         } else if let [x, y] = view.signals[..] {
             let (begin, end) = self.extent(all.end);
             let (from, to) = view.window.within(begin, end);
@@ -483,6 +615,10 @@ impl Subject for Played {
 
     fn blocks(&self, view: &View, since: Option<u64>, frame: &mut Frame) {
         self.recording().blocks(view, since, frame);
+    }
+
+    fn points(&self, curve: u32, from: f64, each: &mut dyn FnMut(f64, f64) -> bool) {
+        self.recording().points(curve, from, each);
     }
 
     fn say(&self, _: &str) -> Result<String, String> {

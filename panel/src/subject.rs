@@ -22,6 +22,10 @@ pub trait Subject: Send + Sync {
     /// Appends the curves of a view that have changed after version `since`; all of them if none.
     fn blocks(&self, view: &View, since: Option<u64>, frame: &mut Frame);
 
+    /// Calls `each` with the points of a curve from one instant on, s, in its unit and in the order of time, with one
+    /// point before it, until it returns false.
+    fn points(&self, curve: u32, from: f64, each: &mut dyn FnMut(f64, f64) -> bool);
+
     /// Obeys the words of a page.
     ///
     /// # Errors

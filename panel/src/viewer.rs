@@ -9,9 +9,10 @@
 
 use crate::frame::Frame;
 use crate::key::Key;
-use crate::line::{self, Line, View};
+use crate::line::{self, Crossing, Line, View};
+use crate::measures;
 use crate::subject::Subject;
-use serde_json::json;
+use serde_json::{Value, json};
 use std::collections::{BTreeMap, VecDeque};
 use std::io::{self, Read, Write};
 use std::net::{Shutdown, TcpStream};
@@ -200,6 +201,22 @@ impl Viewer {
                 }
                 drop(desk);
                 return self.wake.notify_one();
+            }
+            Ok(Line::Between(number, from, to, curves)) => {
+                let measured = curves.iter().map(|curve| {
+                    let mut points = |each: &mut dyn FnMut(f64, f64) -> bool| subject.points(*curve, from, each);
+                    json!(measures::measures(&mut points, from, to))
+                });
+                let measured: Vec<Value> = measured.collect();
+                let told = json!({ "kind": "measures", "number": number, "curves": curves, "measures": measured });
+                return self.push(Message::text(told.to_string()));
+            }
+            Ok(Line::Find(number, Crossing { curve, rises, level, after })) => {
+                let mut points = |each: &mut dyn FnMut(f64, f64) -> bool| subject.points(curve, after, each);
+                let t = measures::crossing(&mut points, rises, level, after);
+                // After the search: what came meanwhile is searched the next time.
+                let told = json!({ "kind": "found", "number": number, "t": t });
+                return self.push(Message::text(told.to_string()));
             }
             Ok(Line::Key(_)) => (None, Err("the key is known".into())),
             Err(why) => (None, Err(why)),

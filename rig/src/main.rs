@@ -52,7 +52,7 @@ enum Command {
     Panel(PanelArgs),
     /// Send the running rig to `fric panel USER@HOST`, and its commands here, on the standard streams
     Feed(Store),
-    /// Command the running rig: enable, arm, set PATH = VALUE or stop
+    /// Command the running rig: enable, arm, set PATH = VALUE, mark WORDS or stop
     Say(Say),
     /// Check this computer for real time, and print what to change
     Doctor,
@@ -209,7 +209,8 @@ struct Drives {
 
 #[derive(clap::Args, Debug)]
 struct Say {
-    /// enable, arm, stop; or a set of parameters, `set fr.Fs = 0.5 N·m, fr.Fc = 0.3 N·m`: it is applied as a whole or refused
+    /// enable, arm, stop; or a set of parameters, `set fr.Fs = 0.5 N·m, fr.Fc = 0.3 N·m`: it is applied as a whole or refused; `mark WORDS` writes
+    /// words into its log
     #[arg(value_name = "COMMAND", required = true, allow_negative_numbers = true)]
     what: Vec<String>,
     #[command(flatten)]
@@ -299,7 +300,8 @@ fn installed(args: &Install) -> Result<String, String> {
 fn said(words: &[String]) -> Option<String> {
     let what = words.join(" ");
     let what = what.trim();
-    let known = ["enable", "arm", "stop", "reset"].contains(&what) || what.starts_with("set ");
+    let known =
+        ["enable", "arm", "stop", "reset"].contains(&what) || what.starts_with("set ") || what.starts_with("mark ");
     (known && !what.contains('\n')).then(|| what.to_string())
 }
 
@@ -377,7 +379,7 @@ fn main() -> ExitCode {
         Command::Say(say) => match said(&say.what) {
             Some(what) => run::say(&say.store.dir, &what),
             None => {
-                words::error("say enable, arm, stop or `set PATH = VALUE`");
+                words::error("say enable, arm, stop, `set PATH = VALUE` or `mark WORDS`");
                 return ExitCode::from(2);
             }
         },

@@ -149,7 +149,7 @@ fn shown(
     let reader = Reader::open(&file)?;
     let computed = follow::control(&reader.head, &open.contents.rig, &control, &plant)?;
     let name = file.display().to_string();
-    let recording = Recording::new(&name, &open.contents.rig, control.description(), &computed, keep);
+    let recording = Recording::new(&name, &open.contents.rig, (&control, &plant), &computed, keep);
     let played = Arc::new(Played::new(recording));
     operated.begins(played.clone(), &open.contents.live, &control);
     follow::follow(reader, &played, &|| is_claimed(first), bell);

@@ -11,7 +11,7 @@ use runtime::can::Bus;
 use runtime::can::sim::Simulation;
 use runtime::hil::cycle::{Command, End, Gauges};
 use runtime::hil::live::Judge;
-use runtime::hil::operator::{Answer, NO_RESET, Operator, Reason, Stamp, Stopper};
+use runtime::hil::operator::{Answer, Mark, NO_RESET, Operator, Reason, Stamp, Stopper};
 use runtime::hil::session::{self, Drives, Session, Setup};
 use runtime::hil::simulated::World;
 use runtime::hil::{emergency, watches};
@@ -429,7 +429,7 @@ impl Desk {
 
     /// Tells the stage, the time and the end of the run.
     fn tell_stage(&self, to: &Mutex<&UnixStream>, gone: &AtomicBool) {
-        let (mut last, mut told) = (String::new(), None::<Instant>);
+        let (mut last, mut told, mut energy) = (String::new(), None::<Instant>, (0.0, 0));
         while !gone.load(Ordering::Relaxed) {
             let ended = self.ended.lock().unwrap_or_else(PoisonError::into_inner).clone();
             let stage = self.gauges.stage.get();
@@ -440,6 +440,10 @@ impl Desk {
                 let Stamp::Wall(ns) = Stamp::wall() else { unreachable!("that is what it gives") };
                 heard &= tell_panel(to, &format!("now {ns}"));
                 told = Some(Instant::now());
+            }
+            if self.gauges.energy() != energy {
+                energy = self.gauges.energy();
+                heard &= tell_panel(to, &format!("energy {} {}", energy.0, energy.1));
             }
             if let Some(words) = &ended {
                 tell_panel(to, &format!("over {words}"));
@@ -506,7 +510,10 @@ impl Desk {
             }
             _ => match said.strip_prefix("set ") {
                 Some(set) => Command::Set(self.judge.read(set)?),
-                None => return Err("say enable, arm, set PATH = VALUE or stop".into()),
+                None => match said.strip_prefix("mark ") {
+                    Some(mark) => Command::Mark(Mark::new(mark)?),
+                    None => return Err("say enable, arm, set PATH = VALUE, mark WORDS or stop".into()),
+                },
             },
         };
         let operator = || self.operator.lock().unwrap_or_else(std::sync::PoisonError::into_inner);

@@ -99,13 +99,17 @@ impl Beside {
 
     /// Tells the stage of the rig until the run is over: for a thread of its own.
     pub fn tell(told: &Told, gauges: &Gauges, over: &AtomicBool) {
-        let mut last = String::new();
+        let (mut last, mut energy) = (String::new(), (0.0, 0));
         while !over.load(Ordering::Relaxed) {
             let stage = gauges.stage.get();
             let line = format!("stage {} {stage}", stage.awaits());
             if line != last {
                 told.say(&line);
                 last = line;
+            }
+            if gauges.energy() != energy {
+                energy = gauges.energy();
+                told.say(&format!("energy {} {}", energy.0, energy.1));
             }
             std::thread::sleep(LOOK);
         }

@@ -95,7 +95,7 @@ fn is_log(path: &Path) -> bool {
 fn recording(args: &Args, bell: &Bell, terminal: &Terminal) -> Result<Arc<Played>, String> {
     let Opened { mut reader, ready, control } = rig_log::open(&args.file, args.interpret, terminal)?;
     let name = args.file.display().to_string();
-    let mut recording = Recording::new(&name, &ready.rig, ready.control.description(), &control, args.keep);
+    let mut recording = Recording::new(&name, &ready.rig, (&ready.control, &ready.plant), &control, args.keep);
     let grows = is_claimed(&args.file) && args.save.is_none();
     follow::read_on(&mut reader, &mut recording)?;
     if recording.is_empty() && !grows {
@@ -103,7 +103,9 @@ fn recording(args: &Args, bell: &Bell, terminal: &Terminal) -> Result<Arc<Played
     }
     if !grows || reader.tail().is_some() {
         recording.end(reader.ending("it").unwrap_or_else(|damaged| damaged));
-        return Ok(Arc::new(Played::new(recording)));
+        let played = Arc::new(Played::new(recording));
+        follow::twin(&played, bell);
+        return Ok(played);
     }
     let (played, bell, file) = (Arc::new(Played::new(recording)), bell.clone(), args.file.clone());
     let followed = played.clone();
@@ -138,7 +140,7 @@ fn show_log(operated: &Operated, file: &Path, interpret: bool, keep: u64, bell: 
     match rig_log::open(file, interpret, &Terminal::new()) {
         Ok(Opened { reader, ready, control }) => {
             let name = file.display().to_string();
-            let recording = Recording::new(&name, &ready.rig, ready.control.description(), &control, keep);
+            let recording = Recording::new(&name, &ready.rig, (&ready.control, &ready.plant), &control, keep);
             let played = Arc::new(Played::new(recording));
             operated.begins(played.clone(), &ready.live, &ready.control);
             follow::follow(reader, &played, more, bell);

@@ -11,7 +11,7 @@ use crate::terminal::Terminal;
 use abi::Instance;
 use grammar::diagnostic::Diagnostic;
 use runtime::hil::live::{Judge, Set};
-use runtime::hil::operator::{Answer, Command, NO_RESET, Operator, Reason};
+use runtime::hil::operator::{Answer, Command, Mark, NO_RESET, Operator, Reason};
 use runtime::record::log::Sections;
 use std::io::BufRead;
 use std::sync::mpsc::{Receiver, channel};
@@ -144,10 +144,13 @@ fn carry_out(mut operator: Operator, mut rehearsal: Option<Rehearsal>, typed: &R
         let done = match (text.as_str(), text.strip_prefix("set "), &mut rehearsal) {
             ("enable", ..) => wait(Command::Enable),
             ("arm", ..) => wait(Command::Arm),
+            (text, ..) if text == "mark" || text.starts_with("mark ") => {
+                Mark::new(&text[4..]).and_then(|mark| wait(Command::Mark(mark)))
+            }
             ("reset", ..) => Err(NO_RESET.into()),
             (_, Some(set), Some(rehearsal)) => rehearsal.change(&mut operator, set),
             (_, Some(_), None) => Err(Reason::Unjudged.words()),
-            (_, None, _) => Err("type enable, arm, set PATH = VALUE or stop".into()),
+            (_, None, _) => Err("type enable, arm, set PATH = VALUE, mark WORDS or stop".into()),
         };
         match (&done, &line) {
             (Ok(()), Line::Typed(text)) if text.starts_with("set ") => terminal.line(&format!("  {text}")),

@@ -28,7 +28,7 @@ pub fn replay(args: &Args, terminal: &mut Terminal) -> End {
     let rig = &ready.rig.name;
     let mut exports = Exports::new(args, &ready.rig, &control);
     let mut replay = Replay::new(&ready.rig, control);
-    let mut stopped = None;
+    let (mut stopped, mut marks) = (None, Vec::new());
     loop {
         let message = match reader.message() {
             Ok(Some(message)) => message,
@@ -36,6 +36,9 @@ pub fn replay(args: &Args, terminal: &mut Terminal) -> End {
             Err(error) => return fail(terminal, &error.to_string()),
         };
         exports.add(&message);
+        if let (trace::MARK, Some((due_ns, words))) = (message.kind, trace::read_mark(&message.words)) {
+            marks.push(format!("  mark at {:.3} s: {words}", due_ns as f64 * 1e-9));
+        }
         if stopped.is_none() {
             stopped = replay.message(&message).err();
         }
@@ -71,6 +74,7 @@ pub fn replay(args: &Args, terminal: &mut Terminal) -> End {
                 quantity::count(found.cycles),
                 quantity::count(found.states)
             ));
+            marks.iter().for_each(|mark| terminal.line(mark));
             if found.skipped + found.lost > 0 {
                 terminal.line(&format!(
                     "  {} messages were lost when it was written; {} cycles could not be computed",

@@ -605,6 +605,24 @@ impl Subject for WhatIf {
         }
     }
 
+    fn points(&self, curve: u32, from: f64, each: &mut dyn FnMut(f64, f64) -> bool) {
+        let (ran, case, signal) = {
+            let inner = self.inner();
+            let (signals, cases) = (inner.setup.sheet.signals.len(), inner.setup.cases.len());
+            let (number, signal) = (curve as usize / signals.max(1), curve as usize % signals.max(1));
+            let layer = inner.layers.get(number / cases);
+            let Some(ran) = layer.and_then(|layer| layer.ran.clone()) else { return };
+            (ran, number % cases, signal)
+        };
+        let Some(points) = ran.curves.get(case).and_then(|curves| curves.get(signal)) else { return };
+        let begin = points.partition_point(|point| point.0 < from).saturating_sub(1);
+        for (t, value) in &points[begin..] {
+            if !each(*t, *value) {
+                return;
+            }
+        }
+    }
+
     fn say(&self, words: &str) -> Result<String, String> {
         let (word, rest) = words.split_once(' ').map_or((words, ""), |(word, rest)| (word, rest.trim()));
         let mut inner = self.inner();

@@ -9,6 +9,8 @@ mod hostile;
 mod operated;
 mod people;
 mod recording;
+mod remote;
+mod soak;
 mod strangers;
 mod what_if;
 

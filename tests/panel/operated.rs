@@ -286,3 +286,125 @@ fn the_buttons_enable_and_arm_a_rig() {
     assert_eq!(rig.code(), 0);
     assert_eq!(page.complaints(), [""; 0]);
 }
+
+/// A client of its own on the page's connection, as `client`: it draws what comes, and `ask(line)` gives the time in ms to
+/// the answer of the panel, or of the rig where that answers.
+const CLIENT: &str = r#"new Promise(ready => {
+    const s = new WebSocket(`ws://${location.host}/socket`), waits = new Map(), rigs = new Map();
+    let number = 0, end = 0;
+    s.binaryType = 'arraybuffer';
+    s.onopen = () => { s.send('key ' + sessionStorage.getItem('key')); setTimeout(() => s.send('view 0 0 last 5 100'), 300); };
+    s.onmessage = e => {
+        if (typeof e.data !== 'string') {
+            end = new DataView(e.data).getFloat64(8, true);
+            s.send('ack ' + new DataView(e.data).getUint32(0, true));
+            if (end > 0) ready(true);
+            return;
+        }
+        const m = JSON.parse(e.data);
+        if (m.kind === 'answer' && waits.has(m.number)) {
+            const done = waits.get(m.number);
+            if (m.refused || !done.rig) { done.resolve([performance.now() - done.begun, m.refused ?? '']); waits.delete(m.number); }
+            else rigs.set(Number(m.ok), m.number);
+        }
+        const told = m.kind === 'state' ? m.is.answer : null, own = told && rigs.get(told.number);
+        if (own !== null && waits.has(own)) {
+            const done = waits.get(own);
+            waits.delete(own);
+            done.resolve([performance.now() - done.begun, told.refused ?? '']);
+        }
+    };
+    window.client = {
+        socket: s,
+        say: line => s.send(`${++number} @${end} ${line}`),
+        ask: (line, rig) => new Promise(resolve => {
+            waits.set(++number, { resolve, rig, begun: performance.now() });
+            s.send(`${number} @${end} ${line}`);
+        }),
+    };
+})"#;
+
+/// Prints how long a command takes to the cycle that answers it, and what that is made of. The bound is loose: other tests
+/// run beside this one.
+#[test]
+fn a_command_reaches_the_next_cycle_soon() {
+    let rig = Rig::start("soon", &[]);
+    let page = browser().page(&rig.link);
+    sentence(&page, "armed");
+    page.value(CLIENT);
+    let median = |line: &str, of_rig: bool| {
+        let times = page.value(&format!(
+            "(async () => {{ const all = []; for (let i = 0; i < 31; i++) {{ \
+                 all.push((await client.ask({line:?}.replace('#', String(0.42 + 0.001 * (i % 2))), {of_rig}))[0]); \
+                 await new Promise(done => setTimeout(done, 60)); }} return all.sort((a, b) => a - b); }})()"
+        ));
+        let times: Vec<f64> = times.as_array().unwrap().iter().map(|time| time.as_f64().unwrap()).collect();
+        (times[times.len() / 2], times[0], times[times.len() - 1])
+    };
+    let page_and_panel = median("nothing", false);
+    let and_cycle = median("enable", true);
+    let set = median("set fr.Fs = # N·m", true);
+    for (what, (median, least, most)) in [
+        ("page, panel, page", page_and_panel),
+        ("page, panel, prompt, next cycle and back", and_cycle),
+        ("the same with a set, which is compiled and judged before", set),
+    ] {
+        println!("{what}: median {median:.1} ms, {least:.1} to {most:.1} ms");
+    }
+    assert!(set.0 < 2000.0, "{set:?}");
+}
+
+#[test]
+fn a_stop_is_obeyed_with_a_full_queue_and_before_a_deaf_flood() {
+    let mut rig = Rig::start("flood", &[]);
+    let (one, other) = (browser().page(&rig.link), browser().page(&rig.link));
+    sentence(&one, "armed");
+    sentence(&other, "armed");
+    // A program that holds the key, floods the panel and reads nothing of what it says.
+    let address = rig.link.trim_start_matches("http://").split_once("/#").expect("a key").0.to_string();
+    let mut deaf = crate::soak::Client::connect(&address, rig.link.split_once('#').expect("a key").1, &[]);
+    for number in 0..150 {
+        deaf.say(&format!("{number} @0 set fr.Fs = 0.5 N·m"));
+    }
+    // More commands than may wait: the rest is refused at once.
+    one.value(CLIENT);
+    let refused = one.value(
+        "(async () => { const all = []; for (let i = 0; i < 60; i++) all.push(client.ask('set fr.Fs = 0.43 N·m', true)); \
+         const first = await Promise.race([Promise.all(all), new Promise(done => setTimeout(() => done(all), 3000))]); \
+         return Promise.all(all.map(one => Promise.race([one.then(a => a[1]), Promise.resolve('waits')]))); })()",
+    );
+    let refused: Vec<&str> = refused.as_array().unwrap().iter().filter_map(|why| why.as_str()).collect();
+    println!(
+        "{} of {} answered as full",
+        refused.iter().filter(|why| why.contains("wait already")).count(),
+        refused.len()
+    );
+    one.value("for (let i = 0; i < 60; i++) client.say('set fr.Fs = 0.44 N·m')");
+    other.key("Escape");
+    sentence(&other, "ended as asked");
+    assert_eq!(rig.code(), 0);
+    sentence(&one, "ended as asked");
+    replayed(&rig.log);
+    drop(deaf);
+}
+
+#[test]
+fn a_rig_that_a_fault_stops_says_why() {
+    let mut rig = Rig::start("fault", &["--inject", "load fault 0x2310 at 6 s"]);
+    let page = browser().page(&rig.link);
+    sentence(&page, "armed");
+    sentence(&page, "stopped: ");
+    assert_eq!(rig.code(), 3);
+    let why = page.text("document.getElementById('sentence').textContent");
+    assert!(why.contains("load"), "{why}");
+    assert!(page.text("document.title").starts_with('▲'));
+    page.wait("document.querySelector('#drives .light.bad')");
+    page.wait("new Promise(done => requestAnimationFrame(() => setTimeout(() => done(true), 300)))");
+    page.shot("rig-fault");
+    // What it cannot do any more it does not offer.
+    page.wait("document.getElementById('next').hidden");
+    page.media("prefers-color-scheme", "dark");
+    page.wait("new Promise(done => requestAnimationFrame(() => setTimeout(() => done(true), 300)))");
+    page.shot("rig-fault-dark");
+    assert_eq!(page.complaints(), [""; 0]);
+}

@@ -51,7 +51,7 @@ fn a_recording_is_looked_through() {
     let extremes = rows.iter().fold((f64::MAX, f64::MIN), |(low, high), row| (low.min(row.1), high.max(row.1)));
     let told = page.text("document.querySelector('.plot canvas[role=img]').getAttribute('aria-label')");
     let number = |word: &str| word.replace('−', "-").parse::<f64>().unwrap_or(f64::NAN);
-    let words: Vec<f64> = told.split([' ', ',']).map(number).filter(|x| x.is_finite()).collect();
+    let words: Vec<f64> = told.split([' ', ',', ';']).map(number).filter(|x| x.is_finite()).collect();
     for wanted in [extremes.0, extremes.1, rows.last().unwrap().1] {
         assert!(words.iter().any(|word| (word - wanted).abs() <= 1e-3 * wanted.abs().max(1e-6)), "{wanted} in {told}");
     }
@@ -192,4 +192,65 @@ fn a_rig_that_runs_is_followed_through_its_log() {
     let killed = Instant::now();
     page.wait("/killed/.test(document.getElementById('sentence').textContent)");
     assert!(killed.elapsed() < Duration::from_secs(20), "{:?}", killed.elapsed());
+}
+
+#[test]
+fn cursors_measure_all_points_and_a_trigger_finds_the_cycle() {
+    let path = log("cursors", 4);
+    let csv = path.with_extension("csv");
+    let output = fric().args(["replay", path.to_str().unwrap(), "--csv"]).arg(&csv).output().unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let table = fs::read_to_string(&csv).unwrap();
+    let mut lines = table.lines();
+    let at = lines.next().unwrap().split(',').position(|name| name == "body.v [rpm]").expect("a column");
+    let rows: Vec<(f64, f64)> = lines
+        .map(|line| {
+            let cells: Vec<&str> = line.split(',').collect();
+            (cells[1].parse().unwrap(), cells[at].parse().unwrap())
+        })
+        .collect();
+    let panel = Panel::open(&[path.to_str().unwrap()]);
+    let page = browser().page(&panel.link);
+    page.wait("/ to .* at the end/.test(document.querySelector('.plot canvas[role=img]')?.getAttribute('aria-label'))");
+    page.key("c");
+    let number = |text: &str| text.replace('−', "-").parse::<f64>().unwrap_or(f64::NAN);
+    let row =
+        "[...document.querySelectorAll('#cursors tbody tr')].find(r => r.textContent.startsWith('body.v in rpm'))";
+    // Means and the root of the mean square come from the panel.
+    page.wait(&format!("{row} && !isNaN(parseFloat({row}.cells[4].textContent.replace('−', '-')))"));
+    let cells = page.value(&format!("[...{row}.cells].map(c => c.textContent)"));
+    let cells: Vec<f64> = cells.as_array().unwrap().iter().map(|cell| number(cell.as_str().unwrap())).collect();
+    let head = page.text("document.querySelector('#cursors th').textContent");
+    let times: Vec<f64> = head.split([' ', ':']).map(number).filter(|x| x.is_finite()).collect();
+    let inside: Vec<&(f64, f64)> = rows.iter().filter(|row| (times[0]..=times[1]).contains(&row.0)).collect();
+    let of = |f: fn(f64, f64) -> f64, begin: f64| inside.iter().fold(begin, |sum, row| f(sum, row.1));
+    let n = inside.len() as f64;
+    let (low, high) = (of(f64::min, f64::MAX), of(f64::max, f64::MIN));
+    let (mean, rms) = (of(|sum, y| sum + y, 0.0) / n, (of(|sum, y| sum + y * y, 0.0) / n).sqrt());
+    for (what, found, wanted) in
+        [("min", cells[2], low), ("max", cells[3], high), ("mean", cells[4], mean), ("rms", cells[5], rms)]
+    {
+        assert!((found - wanted).abs() < 5e-3 * (high - low), "{what}: {found}, not {wanted}; {head} {cells:?}");
+    }
+    assert!((cells[6] - (high - low)).abs() < 1e-3 * (high - low), "{cells:?}");
+
+    // The first rise above 20 rpm, and the next ones, each at its cycle.
+    let rises: Vec<f64> =
+        rows.windows(2).filter(|pair| pair[0].1 < 20.0 && pair[1].1 >= 20.0).map(|pair| pair[1].0).collect();
+    assert!(!rises.is_empty());
+    page.value("document.getElementById('triggered').click()");
+    page.value(
+        "(() => { const [signal, way] = document.querySelectorAll('#trigger select'); \
+         signal.value = [...signal.options].find(o => o.text === 'body.v in rpm').value; way.value = 'rises'; \
+         const level = document.querySelector('#trigger input'); level.value = '20'; level.dispatchEvent(new Event('change')); })()",
+    );
+    for wanted in &rises {
+        let told = format!(
+            "Math.abs(parseFloat(document.querySelector('#trigger output').textContent.slice(3)) - {wanted}) < 2e-6"
+        );
+        page.wait(&told);
+        page.shot("recording-trigger");
+        page.value("[...document.querySelectorAll('#trigger button')].at(-1).click()");
+    }
+    assert_eq!(page.complaints(), [""; 0]);
 }

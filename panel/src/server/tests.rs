@@ -33,6 +33,13 @@ impl Subject for Counting {
         let points = vec![(0.0, self.version() as f64); 4000];
         frame.path(Block { kind: PATH, view: view.id, curve: 0, cycles: 0, first: 0.0 }, &points);
     }
+    /// A ramp that starts anew each second.
+    fn points(&self, curve: u32, from: f64, each: &mut dyn FnMut(f64, f64) -> bool) {
+        let first = (from * 100.0).max(0.0) as u32;
+        (first.saturating_sub(1)..500)
+            .take_while(|_| curve == 0)
+            .all(|k| each(f64::from(k) / 100.0, f64::from(k % 100)));
+    }
     fn say(&self, words: &str) -> Result<String, String> {
         self.said.lock().unwrap().push(words.into());
         if words == "no" { Err("not \u{202e}now".into()) } else { Ok("yes".into()) }

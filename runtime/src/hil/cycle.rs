@@ -107,8 +107,20 @@ pub struct Gauges {
     pub missed: AtomicU64,
     /// Free space on the disk of the log, bytes; 0 without a log.
     pub log_free: AtomicU64,
+    /// Greatest energy that a contact has given back, as a share of what it can store: bits of an `f64`.
+    pub returned_max: AtomicU64,
+    /// Number of cycles whose command was not predicted although the rig looks ahead.
+    pub unpredicted: AtomicU64,
     /// Permitted outputs, then recorded quantities: SI, as bits of an `f64`.
     pub values: Vec<AtomicU64>,
+}
+
+impl Gauges {
+    /// What displays say of the energy at the contacts: the greatest share given back, and the cycles without
+    /// prediction.
+    pub fn energy(&self) -> (f64, u64) {
+        (f64::from_bits(self.returned_max.load(Ordering::Relaxed)), self.unpredicted.load(Ordering::Relaxed))
+    }
 }
 
 /// A running rig.
@@ -388,6 +400,7 @@ impl Hil {
         }
         while let Some(said) = self.commands.next(now_ns, false) {
             let has_effect = match said.command {
+                Command::Mark(mark) => self.mark(&mark),
                 _ if stops => {
                     self.commands.answer(said.number, Answer::Refused(Reason::Stopping));
                     continue;
@@ -411,6 +424,15 @@ impl Hil {
                 _ => {}
             }
         }
+    }
+
+    /// Writes words into the log; false if there is none yet.
+    fn mark(&mut self, mark: &operator::Mark) -> bool {
+        let Some(log) = &mut self.log else { return false };
+        self.words.clear();
+        trace::write_mark(self.due_ns, mark.bytes(), &mut self.words);
+        log.push(trace::MARK, &self.words);
+        true
     }
 
     /// Takes the next set of parameters: one per cycle, so that each set is accepted or refused as a whole.
@@ -658,6 +680,9 @@ impl Hil {
         }
         counts.coupling = self.control.as_ref().and_then(|control| control.coupling().told());
         let gauges = &self.gauges;
+        let coupling = counts.coupling.unwrap_or_default();
+        gauges.returned_max.store(coupling.returned_max.to_bits(), Ordering::Relaxed);
+        gauges.unpredicted.store(coupling.unpredicted, Ordering::Relaxed);
         gauges.now_ns.store(self.due_ns, Ordering::Relaxed);
         gauges.cycles.store(counts.cycles, Ordering::Relaxed);
         gauges.late_ns.store(self.cycle.late_ns.into(), Ordering::Relaxed);

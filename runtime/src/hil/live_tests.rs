@@ -5,7 +5,7 @@ use super::campaign::quick;
 use super::control;
 use super::cycle::{Hil, Options, look_ahead};
 use super::live::{Judge, Objection, Set};
-use super::operator::{Answer, Command, Operator, PLACES, Reason, Stamp, Ticket};
+use super::operator::{Answer, Command, Mark, Operator, PLACES, Reason, Stamp, Ticket};
 use super::simulated::{Pace, World};
 use crate::drive::Step;
 use crate::rng::Chance;
@@ -75,10 +75,11 @@ fn each_command_is_answered_once_and_accepted_sets_act() {
             // Bursts that overflow the queue.
             let burst = [0, 0, 1, 3, 90][chance.below(5) as usize];
             for _ in 0..burst {
-                let command = match 1 + chance.below(11) {
+                let command = match 1 + chance.below(12) {
                     1 => Command::Enable,
                     2 => Command::Arm,
                     3 => stand.set(&[(0, f64::NAN)]),
+                    12 => Command::Mark(Mark::new("second bearing").unwrap()),
                     4 => Command::Set(Set::new(&[(Slot(2), 1.0)]).unwrap()),
                     k if k < 8 => stand.set(&[(0, chance.between(-0.1, 1.1))]),
                     k if k < 10 => stand.set(&[(1, chance.between(-0.05, 0.3))]),

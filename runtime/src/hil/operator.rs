@@ -40,6 +40,42 @@ pub enum Command {
     Stop,
     /// New values of parameters, as one set.
     Set(Set),
+    /// Words for the log, at this cycle.
+    Mark(Mark),
+}
+
+/// Most bytes of a mark.
+pub const MARK_MOST: usize = 96;
+
+/// Words of an operator for the log.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub struct Mark {
+    bytes: [u8; MARK_MOST],
+    len: usize,
+}
+
+impl Mark {
+    /// A mark of these words.
+    ///
+    /// # Errors
+    /// Why they are none.
+    pub fn new(words: &str) -> Result<Mark, String> {
+        let words = words.trim();
+        if words.is_empty() {
+            return Err("a mark has words: `mark second bearing`".into());
+        }
+        if words.len() > MARK_MOST || words.chars().any(char::is_control) {
+            return Err(format!("a mark is a line of at most {MARK_MOST} bytes, and this one has {}", words.len()));
+        }
+        let mut bytes = [0; MARK_MOST];
+        bytes[..words.len()].copy_from_slice(words.as_bytes());
+        Ok(Mark { bytes, len: words.len() })
+    }
+
+    /// Its bytes.
+    pub fn bytes(&self) -> &[u8] {
+        &self.bytes[..self.len]
+    }
 }
 
 impl Command {
@@ -50,6 +86,7 @@ impl Command {
             Command::Arm => "arm",
             Command::Stop => "stop",
             Command::Set(_) => "set",
+            Command::Mark(_) => "mark",
         }
     }
 }

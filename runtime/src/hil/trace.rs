@@ -13,6 +13,27 @@ use abi::rig::Rig;
 pub use crate::record::log::{CYCLE, STATE};
 /// Kind of message: frames of a cycle.
 pub const FRAMES: u32 = 3;
+/// Kind of message: words of an operator.
+pub const MARK: u32 = 5;
+
+/// Appends a mark as words: its time in ns, its length in bytes, its bytes.
+pub fn write_mark(due_ns: u64, bytes: &[u8], words: &mut Vec<u64>) {
+    words.extend([due_ns, bytes.len() as u64]);
+    for piece in bytes.chunks(8) {
+        let mut word = [0; 8];
+        word[..piece.len()].copy_from_slice(piece);
+        words.push(u64::from_le_bytes(word));
+    }
+}
+
+/// Time in ns and words of a mark; none if it is not one.
+pub fn read_mark(words: &[u64]) -> Option<(u64, String)> {
+    let [due_ns, length, rest @ ..] = words else { return None };
+    let mut bytes: Vec<u8> = rest.iter().flat_map(|word| word.to_le_bytes()).collect();
+    let length = usize::try_from(*length).ok().filter(|length| *length <= bytes.len())?;
+    bytes.truncate(length);
+    Some((*due_ns, String::from_utf8(bytes).ok()?))
+}
 
 /// The record of one cycle.
 #[derive(Clone, PartialEq, Debug)]

@@ -1,0 +1,302 @@
+//! The panel of a rig that `fric-rig` runs, beside it and from another computer.
+
+use crate::browser::{Page, browser};
+use crate::{folder, fric};
+use serde_json::json;
+use std::fs;
+use std::io::{BufRead, BufReader, Read};
+use std::os::unix::fs::PermissionsExt;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::sync::LazyLock;
+use std::time::{Duration, Instant};
+
+/// A rig at a rate that a busy computer keeps, on a simulated bus: it arms itself.
+const RIG: &str = r#"
+import std.friction
+import std.control
+import std.plant
+
+rig slow {
+  run rotary Servo(
+        r   = step(0 s, 1 rad),
+        m   = 0.012 kg·m^2,
+        pid = rotary PIDDiscrete(Kp = 0.1 N·m/rad, Ti = 0.2 s, Td = 80 ms,
+                                 N = 10, u_max = 2 N·m, Ts = 10 ms),
+        fr  = rotary LuGre(sigma0 = 2 N·m/rad, sigma1 = 0.05 N·m·s/rad,
+                           sigma2 = 0.018 N·m·s/rad, Fc = 0.28 N·m,
+                           Fs = 0.42 N·m, vs = 0.01 rad/s, vd = 0.1 rad/s))
+  rate     10 ms
+  bus      can0  = sim("bench")
+  drive    load  = cia402(can0, node = 3, T_rated = 4 N·m, mode = torque,
+                          count = 1 rev / 262144, speed_unit = 0.01 rpm,
+                          delay = 0.8 ms, lag = 0.6 ms, timeout = 1 s)
+  drive    servo = cia402(can0, node = 4, T_rated = 4 N·m, mode = torque,
+                          count = 1 rev / 262144, speed_unit = 0.01 rpm,
+                          delay = 0.8 ms, lag = 0.6 ms, timeout = 1 s)
+  hardware body {
+    servo.torque = F_motor         limit -2 N·m .. 2 N·m
+    load.torque  = -F_load         limit -1 N·m .. 1 N·m  slew 200 N·m/s
+    v            = load.speed
+    x            = servo.position
+  }
+  watchdog 5 s
+  overrun  hold 100
+  safe     load.torque = 0 N·m, servo.torque = 0 N·m
+  stop     when abs(body.v) > 150 rad/s, "overspeed"
+  record   fr.F [N·m]
+  plot     body.x [deg], r [deg]
+  plot     fr.F [N·m] against body.v [rpm]
+  tune     fr.vs, fr.Fs in 0.3 N·m .. 0.6 N·m
+}
+"#;
+
+/// The program of the rig's computer, built beside this one.
+static FRIC_RIG: LazyLock<PathBuf> = LazyLock::new(|| {
+    let mut build = Command::new(env!("CARGO"));
+    build.current_dir(crate::root()).args(["build", "--offline", "-p", "fric-rig"]);
+    assert!(build.status().unwrap().success(), "fric-rig is needed for this test and cannot be built");
+    Path::new(env!("CARGO_BIN_EXE_fric")).with_file_name("fric-rig")
+});
+
+/// A program that runs, until dropped.
+struct Running {
+    child: Child,
+    link: String,
+    told: Option<std::thread::JoinHandle<String>>,
+}
+
+impl Running {
+    /// Starts a program that prints the link of a panel; what it says afterwards is collected.
+    fn start(command: &mut Command, has_panel: bool) -> Running {
+        let piped = command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::null());
+        let mut child = piped.spawn().expect("it starts");
+        let mut lines = BufReader::new(child.stdout.take().expect("piped"));
+        let mut link = String::new();
+        while has_panel && !link.starts_with("panel  ") {
+            link.clear();
+            assert!(lines.read_line(&mut link).expect("a line") > 0, "no link");
+        }
+        let told = std::thread::spawn(move || {
+            let mut all = String::new();
+            let _ = lines.read_to_string(&mut all);
+            all
+        });
+        Running { child, link: link.trim().trim_start_matches("panel  ").into(), told: Some(told) }
+    }
+
+    fn code(&mut self) -> i32 {
+        let begun = Instant::now();
+        loop {
+            if let Some(status) = self.child.try_wait().expect("it is ours") {
+                return status.code().unwrap_or(-1);
+            }
+            assert!(begun.elapsed() < Duration::from_secs(60), "it does not end");
+            std::thread::sleep(Duration::from_millis(20));
+        }
+    }
+}
+
+impl Drop for Running {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+        drop(self.told.take());
+    }
+}
+
+/// A folder with the packed rig.
+fn packed(name: &str) -> PathBuf {
+    let folder = folder(name);
+    fs::write(folder.join("slow.fric"), RIG).unwrap();
+    let output = fric()
+        .current_dir(&folder)
+        .args(["build", "slow.fric", "-o", "slow.fricpkg"])
+        .env("XDG_CONFIG_HOME", folder.join("config"))
+        .output()
+        .unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    folder
+}
+
+fn rig(folder: &Path, more: &[&str]) -> Command {
+    let mut command = Command::new(&*FRIC_RIG);
+    command.current_dir(folder).args(["run", "slow.fricpkg", "--dir", "there", "--log", "slow.friclog"]).args(more);
+    command
+}
+
+/// An `ssh` that runs the command on this computer.
+fn ssh(folder: &Path) -> String {
+    let bin = folder.join("bin");
+    fs::create_dir_all(&bin).unwrap();
+    let script = "#!/bin/sh\nwhile [ \"$1\" != -- ]; do shift; done\nshift 2\nexec sh -c \"exec $*\"\n";
+    fs::write(bin.join("ssh"), script).unwrap();
+    fs::set_permissions(bin.join("ssh"), fs::Permissions::from_mode(0o755)).unwrap();
+    format!("{}:{}", bin.display(), std::env::var("PATH").unwrap_or_default())
+}
+
+fn sentence(page: &Page, text: &str) {
+    page.wait(&format!("document.getElementById('sentence')?.textContent.startsWith({text:?})"));
+}
+
+fn happened(what: &str) -> String {
+    format!("document.getElementById('happened').textContent.includes('{what}')")
+}
+
+/// Types a value into the field of a parameter, and Enter.
+fn typed(page: &Page, path: &str, text: &str) {
+    page.value(&format!(
+        "(() => {{ const k = [...document.querySelectorAll('.knob')].find(k => k.querySelector('b').textContent === '{path}'); \
+         const f = k.querySelector('input'); f.focus(); f.select(); }})()"
+    ));
+    page.typed(text);
+    page.key("Enter");
+}
+
+/// What an operator does, until it has an effect: on a busy machine a command may be too old.
+fn again(page: &Page, act: &dyn Fn(), effect: &str) {
+    for _ in 0..20 {
+        act();
+        let begun = Instant::now();
+        while begun.elapsed() < Duration::from_secs(3) {
+            if page.value(&format!("!!({effect})")) == true {
+                return;
+            }
+            std::thread::sleep(Duration::from_millis(50));
+        }
+    }
+    page.wait(effect);
+}
+
+/// What the page of the packed rig shows and does, on whichever computer it is served.
+fn operated(page: &Page) {
+    sentence(page, "armed, the model runs");
+    // `plot` makes the canvases: one over time with both positions, one in the plane; then what nobody plotted.
+    page.wait("document.querySelectorAll('#times .plot').length > 1 && document.querySelectorAll('#planes .plot').length === 1");
+    let names = page.text("document.querySelector('#times .names').textContent");
+    assert!(names.contains("body.x") && names.contains("r "), "{names}");
+    // `tune` makes the controls, in its order and within its ends.
+    assert_eq!(
+        page.value("[...document.querySelectorAll('.knob b')].map(b => b.textContent)"),
+        json!(["fr.vs", "fr.Fs"])
+    );
+    again(page, &|| typed(page, "fr.Fs", "0.5 N·m"), &happened("fr.Fs = 0.5 N·m"));
+    again(
+        page,
+        &|| typed(page, "fr.Fs", "0.7 N·m"),
+        "document.getElementById('problem').textContent.includes('from 0.3 N·m to 0.6 N·m (`tune`), not to 0.7 N·m')",
+    );
+    // A mark stands in the log at its cycle.
+    page.value("document.activeElement.blur()");
+    let mark = || {
+        page.key("m");
+        page.typed("second bearing");
+        page.key("Enter");
+    };
+    again(page, &mark, &happened("second bearing"));
+}
+
+fn replayed(log: &Path) {
+    let output = fric().arg("replay").arg(log).output().unwrap();
+    let told = String::from_utf8_lossy(&output.stdout).into_owned();
+    assert!(output.status.success(), "{told}{}", String::from_utf8_lossy(&output.stderr));
+    assert!(told.contains("second bearing"), "{told}");
+}
+
+fn stops_of(parent: u32, name: &str) -> u32 {
+    let all =
+        fs::read_dir("/proc").unwrap().flatten().filter_map(|entry| entry.file_name().to_str()?.parse::<u32>().ok());
+    let is_child = |pid: &u32| {
+        let stat = fs::read_to_string(format!("/proc/{pid}/stat")).unwrap_or_default();
+        let rest = stat.rsplit_once(") ").map(|(_, rest)| rest.to_string()).unwrap_or_default();
+        let line = fs::read_to_string(format!("/proc/{pid}/cmdline")).unwrap_or_default();
+        rest.split(' ').nth(1) == Some(&parent.to_string()) && line.contains(name)
+    };
+    all.into_iter().find(is_child).unwrap_or_else(|| panic!("{parent} has no child {name}"))
+}
+
+fn signal(pid: u32, name: &str) {
+    assert!(Command::new("kill").args([name, &pid.to_string()]).status().unwrap().success());
+}
+
+#[test]
+fn a_packed_rig_has_its_panel_beside_it() {
+    let folder = packed("beside");
+    let mut running = Running::start(&mut rig(&folder, &["--sim", "--panel", "--port", "0"]), true);
+    let page = browser().page(&running.link);
+    operated(&page);
+    page.shot("rig-plots");
+    // A second panel shows and commands the same rig; the first one's end changes nothing.
+    let mut second = Command::new(&*FRIC_RIG);
+    second.current_dir(&folder).args(["panel", "--dir", "there", "--port", "0"]);
+    let mut second = Running::start(&mut second, true);
+    let other = browser().page(&second.link);
+    sentence(&other, "armed");
+    signal(stops_of(running.child.id(), "panel"), "-KILL");
+    sentence(&page, "not connected");
+    other.wait("document.querySelectorAll('.knob').length === 2");
+    other.key("Escape");
+    sentence(&other, "ended as asked");
+    assert_eq!(running.code(), 0);
+    replayed(&folder.join("slow.friclog"));
+    drop(other);
+    assert_eq!(second.code(), 0);
+    // Where no rig runs, there is no panel.
+    let output = Command::new(&*FRIC_RIG).current_dir(&folder).args(["panel", "--dir", "there"]).output().unwrap();
+    assert_eq!(output.status.code(), Some(1));
+    assert!(String::from_utf8_lossy(&output.stderr).contains("no rig runs in there"));
+}
+
+#[test]
+fn a_rig_on_another_computer_is_operated_through_ssh() {
+    let folder = packed("remote");
+    let path = ssh(&folder);
+    let mut running = Running::start(&mut rig(&folder, &["--sim"]), false);
+    let panel = || {
+        let mut command = fric();
+        command.args(["panel", "anna@rig", "-o", "Port=2222", "--no-open", "--port", "0", "--rig"]).arg(&*FRIC_RIG);
+        command.arg("--dir").arg(folder.join("there")).env("PATH", &path);
+        command
+    };
+    let begun = Instant::now();
+    while !folder.join("there/control").exists() {
+        assert!(begun.elapsed() < Duration::from_secs(60), "the rig does not start");
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    let first = Running::start(&mut panel(), true);
+    let page = browser().page(&first.link);
+    operated(&page);
+
+    // The link stands still: what is given meanwhile is old when it arrives, and refused; a stop is not.
+    let feed = stops_of(first.child.id(), "feed");
+    signal(feed, "-STOP");
+    std::thread::sleep(Duration::from_millis(300));
+    typed(&page, "fr.Fs", "0.55 N·m");
+    std::thread::sleep(Duration::from_millis(1500));
+    signal(feed, "-CONT");
+    page.wait("document.getElementById('problem').textContent.includes('old: say it again')");
+    assert_eq!(page.value(&happened("fr.Fs = 0.55 N·m")), json!(false));
+
+    // The connection ends: the page says what that means, and the rig runs on.
+    signal(feed, "-KILL");
+    sentence(&page, "the connection to anna@rig has ended");
+    assert!(page.text("document.getElementById('sentence').textContent").contains("wired stop"));
+    drop(page);
+    let second = Running::start(&mut panel(), true);
+    let page = browser().page(&second.link);
+    sentence(&page, "armed");
+    let feed = stops_of(second.child.id(), "feed");
+    signal(feed, "-STOP");
+    page.key("Escape");
+    std::thread::sleep(Duration::from_millis(1500));
+    signal(feed, "-CONT");
+    sentence(&page, "ended as asked");
+    assert_eq!(running.code(), 0);
+    page.wait(&happened("asked to stop"));
+    replayed(&folder.join("slow.friclog"));
+    // Nobody answers at the other end.
+    let output = panel().output().unwrap();
+    assert_eq!(output.status.code(), Some(1));
+    let told = String::from_utf8_lossy(&output.stderr);
+    assert!(told.contains("no rig runs in") && told.contains("anna@rig feeds no panel"), "{told}");
+}

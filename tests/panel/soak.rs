@@ -1,0 +1,203 @@
+//! Many signals for a long time, before many viewers.
+//!
+//! `FRIC_SOAK`: for how many seconds; 600 for the full test.
+
+use crate::browser::browser;
+use crate::{Panel, folder, fric};
+use serde_json::json;
+use std::fs;
+use std::io::{Read, Write};
+use std::net::TcpStream;
+use std::process::{Child, Stdio};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::time::{Duration, Instant};
+
+/// A rig with simulated drives in wall-clock time, until dropped.
+struct Rig(Child);
+
+impl Drop for Rig {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+/// A program of others that speaks the panel's protocol by hand.
+pub struct Client(TcpStream);
+
+impl Client {
+    fn open(panel: &Panel, views: &[String]) -> Client {
+        Client::connect(panel.origin().trim_start_matches("http://"), panel.key(), views)
+    }
+
+    /// Connects to a panel at this address.
+    pub fn connect(own: &str, key: &str, views: &[String]) -> Client {
+        let mut stream = TcpStream::connect(own).unwrap();
+        let request = format!(
+            "GET /socket HTTP/1.1\r\nHost: {own}\r\nOrigin: http://{own}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n\
+             Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n"
+        );
+        stream.write_all(request.as_bytes()).unwrap();
+        let mut head = Vec::new();
+        while !head.ends_with(b"\r\n\r\n") {
+            let mut byte = [0];
+            stream.read_exact(&mut byte).unwrap();
+            head.push(byte[0]);
+        }
+        let mut client = Client(stream);
+        client.say(&format!("key {key}"));
+        // What asks before the panel has said what there is asks in vain.
+        std::thread::sleep(Duration::from_millis(300));
+        views.iter().for_each(|view| client.say(view));
+        client
+    }
+
+    /// Says a line.
+    pub fn say(&mut self, line: &str) {
+        let mut bytes = vec![0x81];
+        match u8::try_from(line.len()) {
+            Ok(short) if short < 126 => bytes.push(0x80 | short),
+            _ => bytes.extend([0x80 | 126, (line.len() >> 8) as u8, line.len() as u8]),
+        }
+        bytes.extend([0; 4]);
+        bytes.extend(line.as_bytes());
+        let _ = self.0.write_all(&bytes);
+    }
+
+    /// Reads a message: its opcode and its bytes; none at the end.
+    fn message(&mut self) -> Option<(u8, Vec<u8>)> {
+        let mut head = [0; 2];
+        self.0.read_exact(&mut head).ok()?;
+        let length = match head[1] & 0x7f {
+            126 => {
+                let mut more = [0; 2];
+                self.0.read_exact(&mut more).ok()?;
+                usize::from(u16::from_be_bytes(more))
+            }
+            127 => {
+                let mut more = [0; 8];
+                self.0.read_exact(&mut more).ok()?;
+                u64::from_be_bytes(more) as usize
+            }
+            short => usize::from(short),
+        };
+        let mut bytes = vec![0; length];
+        self.0.read_exact(&mut bytes).ok()?;
+        Some((head[0] & 15, bytes))
+    }
+}
+
+/// Resident memory in bytes, and processor time in s.
+fn of_process(pid: u32) -> (f64, f64) {
+    let number = |text: Option<&str>| text.and_then(|text| text.parse::<f64>().ok()).unwrap_or(f64::NAN);
+    let status = fs::read_to_string(format!("/proc/{pid}/status")).unwrap_or_default();
+    let resident = status.lines().find_map(|line| line.strip_prefix("VmRSS:")?.trim().strip_suffix(" kB"));
+    let stat = fs::read_to_string(format!("/proc/{pid}/stat")).unwrap_or_default();
+    let mut words = stat.rsplit_once(") ").map_or("", |(_, rest)| rest).split(' ').skip(11);
+    let ticks = number(words.next()) + number(words.next());
+    (number(resident) * 1024.0, ticks / 100.0)
+}
+
+#[test]
+fn memory_is_flat_before_ten_viewers_of_which_one_is_deaf() {
+    let seconds: f64 = std::env::var("FRIC_SOAK").ok().and_then(|text| text.parse().ok()).unwrap_or(25.0);
+    let folder = folder("soak");
+    let log = folder.join("soak.friclog");
+    // The rig of the example with so many recorded quantities that there are 40 curves in all.
+    let example = fs::read_to_string(crate::root().join("examples/rtfs/rtfs.fric")).unwrap();
+    let more: Vec<String> = (1..=26).map(|i| format!("{i} * body.x [deg]")).collect();
+    let text =
+        example.replace("shaft.torque [N·m]\n", &format!("shaft.torque [N·m]\n  record   {}\n", more.join(", ")));
+    fs::create_dir_all(folder.join("rig")).unwrap();
+    for entry in fs::read_dir(crate::root().join("examples/rtfs")).unwrap().flatten() {
+        let _ = fs::copy(entry.path(), folder.join("rig").join(entry.file_name()));
+    }
+    let file = folder.join("rig/rtfs.fric");
+    fs::write(&file, text).unwrap();
+    let mut command = fric();
+    command.args(["hil", "--sim", "--arm", "--count-overruns", "--quiet"]).arg(&file).args(["rtfs", "--log"]).arg(&log);
+    let rig = command.stdin(Stdio::piped()).stdout(Stdio::null()).stderr(Stdio::null()).spawn().expect("fric starts");
+    let mut rig = Rig(rig);
+    let begun = Instant::now();
+    while fs::metadata(&log).map_or(0, |log| log.len()) < 4096 {
+        assert!(rig.0.try_wait().unwrap().is_none() && begun.elapsed() < Duration::from_secs(60), "no log");
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    // Memory for some seconds of curves, so that it is full soon.
+    let panel = Panel::open(&[log.to_str().unwrap(), "--keep", "10MB"]);
+    let page = browser().page(&panel.link);
+    page.wait("document.querySelectorAll('.plot').length > 10");
+    let signals = page.value("document.querySelectorAll('.names li').length").as_u64().unwrap();
+    assert!(signals >= 40, "{signals} curves");
+    page.value(
+        "(() => { const c = document.querySelector('.plot canvas[role=img]').getContext('2d'), clear = c.clearRect.bind(c); \
+         window.drawn = 0; c.clearRect = (...all) => { window.drawn++; clear(...all); }; })()",
+    );
+    let views: Vec<String> =
+        (0..10).map(|i| format!("view {i} {},{},{},{} last 20 1200", 4 * i, 4 * i + 1, 4 * i + 2, 4 * i + 3)).collect();
+    let over = Arc::new(AtomicBool::new(false));
+    let frames = Arc::new(AtomicU64::new(0));
+    let readers: Vec<_> = (0..8)
+        .map(|i| {
+            let (mut client, over, frames) = (Client::open(&panel, &views), over.clone(), frames.clone());
+            client.0.set_read_timeout(Some(Duration::from_secs(20))).unwrap();
+            std::thread::spawn(move || {
+                while !over.load(Ordering::Relaxed) {
+                    let Some((opcode, bytes)) = client.message() else { break };
+                    if opcode == 2 {
+                        frames.fetch_add(1, Ordering::Relaxed);
+                        // One of them is slow.
+                        if i == 0 {
+                            std::thread::sleep(Duration::from_millis(700));
+                        }
+                        client.say(&format!("ack {}", u32::from_le_bytes(bytes[..4].try_into().unwrap())));
+                    }
+                }
+            })
+        })
+        .collect();
+    let deaf = Client::open(&panel, &views);
+    let heap = || {
+        page.call("HeapProfiler.enable", json!({}));
+        page.call("HeapProfiler.collectGarbage", json!({}));
+        page.call("Runtime.getHeapUsage", json!({}))["usedSize"].as_f64().unwrap()
+    };
+    // The window of 20 s and the curves in memory are full after a while.
+    std::thread::sleep(Duration::from_secs_f64(0.5 * seconds.min(60.0)));
+    let (begun, first) = (Instant::now(), (heap(), of_process(panel.child.id()), of_process(rig.0.id())));
+    let drawn = page.value("window.drawn").as_f64().unwrap();
+    let (mut least, mut most) = (f64::INFINITY, 0.0_f64);
+    while begun.elapsed().as_secs_f64() < 0.5 * seconds + 0.5 * (seconds - 60.0).max(0.0) {
+        std::thread::sleep(Duration::from_secs_f64((seconds / 10.0).min(30.0)));
+        let resident = of_process(panel.child.id()).0;
+        (least, most) = (least.min(resident), most.max(resident));
+    }
+    let elapsed = begun.elapsed().as_secs_f64();
+    let last = (heap(), of_process(panel.child.id()), of_process(rig.0.id()));
+    let drawn = (page.value("window.drawn").as_f64().unwrap() - drawn) / elapsed;
+    println!(
+        "{signals} curves at 1 kHz for {elapsed:.0} s, 10 viewers: page heap {:.2} to {:.2} MB, panel {:.1} to {:.1} MB \
+         ({:.1} to {:.1} between), {:.1} % of a core, rig {:.1} %; {drawn:.0} pictures/s, {:.1} frames/s to each of 8 others",
+        first.0 * 1e-6,
+        last.0 * 1e-6,
+        first.1.0 * 1e-6,
+        last.1.0 * 1e-6,
+        least * 1e-6,
+        most * 1e-6,
+        100.0 * (last.1.1 - first.1.1) / elapsed,
+        100.0 * (last.2.1 - first.2.1) / elapsed,
+        frames.load(Ordering::Relaxed) as f64 / 8.0 / elapsed,
+    );
+    // What fills up does so before; what leaks a frame for each picture would be much larger.
+    assert!(last.0 < first.0 + 1e6, "the page's heap grows from {} to {}", first.0, last.0);
+    assert!(last.1.0 < first.1.0 + 6e6, "the panel grows from {} to {}", first.1.0, last.1.0);
+    assert!(drawn > 0.5, "{drawn} pictures a second");
+    assert!(frames.load(Ordering::Relaxed) > 16, "the others get frames");
+    assert!(rig.0.try_wait().unwrap().is_none(), "the rig runs on");
+    assert_eq!(page.complaints(), [""; 0]);
+    over.store(true, Ordering::Relaxed);
+    drop(deaf);
+    drop(panel);
+    readers.into_iter().for_each(|reader| reader.join().unwrap());
+}
