@@ -72,6 +72,8 @@ const HOMES: &[(&str, &[&str])] = &[
     ("subsetter", &["src/plot/pdf.rs"]),
     ("tempfile", &["src/commands/deploy.rs", "src/commands/panel.rs", "src/commands/remote_rig.rs"]),
     ("terminal_size", &["src/terminal.rs"]),
+    // Pinned for miette, which sets its texts with it.
+    ("textwrap", &["src/report.rs"]),
     // A socket begins as a request.
     ("tungstenite", &["panel/src/http.rs", "panel/src/viewer.rs"]),
 ];
