@@ -118,7 +118,10 @@ fn panels(k: usize, cases: &[Recorded]) -> Vec<Panel> {
         };
         let ends = cases.iter().fold((f64::INFINITY, f64::NEG_INFINITY), times);
         let unit = plot.against.as_ref().map_or(&second, |series| &series.unit);
-        let (from, to) = (plot.view.after.unwrap_or(ends.0), plot.view.before.unwrap_or(ends.1));
+        // A window may depend on what a sweep varies: the axis has room for all.
+        let windows = || cases.iter().filter_map(|case| case.plots.get(k)).map(|plot| &plot.view);
+        let from = windows().map(|view| view.after.unwrap_or(ends.0)).fold(f64::INFINITY, f64::min);
+        let to = windows().map(|view| view.before.unwrap_or(ends.1)).fold(f64::NEG_INFINITY, f64::max);
         x.range = Some((unit.from_si(from), unit.from_si(to)));
     }
     let unseen = Look::default();
@@ -137,7 +140,7 @@ fn panels(k: usize, cases: &[Recorded]) -> Vec<Panel> {
     let shading = cases.len() == 1 && !units.is_empty();
     let bands: Vec<Band> = match cases {
         [case] if shading => {
-            let band = |(series, look): &Shown| Band::of(&name(look, &series.label), &points(case, series, plot));
+            let band = |(series, look): &Shown| Band::of(&name(look, &series.label), &points(case, series, k));
             truths.iter().map(band).collect()
         }
         _ => Vec::new(),
@@ -152,7 +155,7 @@ fn panels(k: usize, cases: &[Recorded]) -> Vec<Panel> {
                 (false, 1) => label.into(),
                 (false, _) => format!("{}, {label}", name(look, &series.label)),
             },
-            points: points(case, series, plot),
+            points: points(case, series, k),
             boolean: series.boolean && over_time,
             marks: false,
             recorded: is_recorded(look),
@@ -160,7 +163,7 @@ fn panels(k: usize, cases: &[Recorded]) -> Vec<Panel> {
         };
         // Recordings, and signals that are equal in all cases, such as a reference, are drawn once.
         let (common, own): (Vec<Shown>, Vec<Shown>) = group.iter().partition(|(series, look)| {
-            is_recorded(look) || over_time && cases.len() > 1 && same_in_all(cases, series, plot)
+            is_recorded(look) || over_time && cases.len() > 1 && same_in_all(cases, series, k)
         });
         // The axis is named after what the models compute, if they do.
         let computed = group.iter().any(|(_, look)| !is_recorded(look));
@@ -253,9 +256,11 @@ fn without(label: &str, path: &str) -> String {
     kept.join(", ")
 }
 
-/// The points of a series in the units shown, over time or against another series, within the window of its plot.
-fn points(case: &Recorded, series: &Series, plot: &Plot) -> Vec<(f64, f64)> {
+/// The points of a series in the units shown, over time or against another series, within the window of the `k`-th
+/// plot, which may depend on what a sweep varies.
+fn points(case: &Recorded, series: &Series, k: usize) -> Vec<(f64, f64)> {
     let recording = case.recording;
+    let Some(plot) = case.plots.get(k) else { return Vec::new() };
     let Some(y) = recording.column(series) else { return Vec::new() };
     let x = plot.against.as_ref().and_then(|against| Some((recording.column(against)?, &against.unit)));
     let (after, before) = (plot.view.after.unwrap_or(f64::NEG_INFINITY), plot.view.before.unwrap_or(f64::INFINITY));
@@ -267,9 +272,9 @@ fn points(case: &Recorded, series: &Series, plot: &Plot) -> Vec<(f64, f64)> {
 }
 
 /// Whether a series is equal in all cases, at the resolution of a picture.
-fn same_in_all(cases: &[Recorded], series: &Series, plot: &Plot) -> bool {
+fn same_in_all(cases: &[Recorded], series: &Series, k: usize) -> bool {
     const SAMPLES: usize = 200;
-    let courses: Vec<Vec<(f64, f64)>> = cases.iter().map(|case| points(case, series, plot)).collect();
+    let courses: Vec<Vec<(f64, f64)>> = cases.iter().map(|case| points(case, series, k)).collect();
     let (first, others) = courses.split_first().expect("there are several cases");
     let (Some((from, _)), Some((to, _))) = (first.first(), first.last()) else { return false };
     let size = first.iter().fold(0.0, |size: f64, (_, y)| size.max(y.abs()));

@@ -902,3 +902,45 @@ fn a_plot_is_opened_by_the_program_of_the_desktop() {
         folder.fric(&["run", "pull.fric", "silent", "--open"]).env("FRIC_OPENER", "no-such-program").output().unwrap();
     assert!(missing.status.success() && String::from_utf8_lossy(&missing.stderr).contains("FRIC_OPENER"));
 }
+
+/// The window of a plot may depend on what a sweep varies: each curve has its own. Over the phase, all have one shape.
+#[test]
+fn each_case_of_a_sweep_is_drawn_in_its_own_window() {
+    let seed: u64 = std::env::var("FRIC_SEED").ok().and_then(|seed| seed.parse().ok()).unwrap_or(29);
+    println!("FRIC_SEED={seed}");
+    let mut state = seed;
+    let mut draw = || {
+        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        (state >> 33) as f64 / (1u64 << 31) as f64
+    };
+    for round in 0..4 {
+        let rates: Vec<String> = (0..4).map(|_| format!("{:.3} Hz", 0.2 + 9.8 * draw())).collect();
+        let text = format!(
+            "model Turning {{\n  param f = 1 Hz in > 0\n  state n = 0\n  dn/dt = f\n  let y = sin(2 * pi * n)\n}}\n\
+             experiment turns {{\n  run Turning() for 3 / f\n  sweep f = {}\n  solver rk4 step 1 ms\n  \
+             plot y against n after 1.25 / f before 2.5 / f\n}}\n",
+            rates.join(", ")
+        );
+        let folder = Folder::new("swept-windows").with("turns.fric", &text);
+        folder.check(&["run", "turns.fric", "--plot", "turns.svg", "--no-error"], 0, "wrote turns.svg");
+        let svg = fs::read_to_string(folder.0.join("turns.svg")).unwrap();
+        // The curves are the paths of many points: where each begins and ends.
+        let ends: Vec<[f64; 2]> = svg
+            .split("<path d=\"M")
+            .filter_map(|path| {
+                let points: Vec<&str> = path.split('"').next()?.split('L').collect();
+                let x = |point: &str| point.split(' ').next()?.parse::<f64>().ok();
+                (points.len() > 20).then_some([x(points[0])?, x(points.last()?)?])
+            })
+            .collect();
+        assert_eq!(ends.len(), rates.len(), "round {round}: {text}{svg}");
+        // One step of the fastest turn is a hundredth of it.
+        let width = ends[0][1] - ends[0][0];
+        for [from, to] in &ends {
+            assert!(
+                (from - ends[0][0]).abs() < 0.02 * width && (to - ends[0][1]).abs() < 0.02 * width,
+                "{ends:?}\n{text}"
+            );
+        }
+    }
+}
