@@ -111,7 +111,9 @@ impl crate::compile::Sources for Disk {
         let (path, bytes) = bytes_named(from, path)?;
         if bytes.starts_with(blocks::MAGIC) {
             let log = path.display();
-            return Err(format!("it is the log of a rig: `fric replay {log} --csv log.csv` makes a table of it"));
+            return Err(format!(
+                "it is the log of a rig: give it the ending .friclog, or make a table of it by `fric replay {log} --csv log.csv`"
+            ));
         }
         Ok((path.display().to_string(), text(bytes)?))
     }
@@ -122,14 +124,23 @@ impl crate::compile::Sources for Disk {
 /// # Errors
 /// Why it cannot be read, in words.
 pub fn bytes_named(from: &str, path: &str) -> Result<(PathBuf, Vec<u8>), String> {
+    let path = path_named(from, path)?;
+    let bytes = read_bytes(&path)?;
+    Ok((path, bytes))
+}
+
+/// The path of a file that the text `from` names; it may be missing.
+///
+/// # Errors
+/// That it is a pipe or a device.
+pub fn path_named(from: &str, path: &str) -> Result<PathBuf, String> {
     let folder = Path::new(from).parent().unwrap_or(Path::new(""));
     let path = tidy(&folder.join(path));
     // A pipe named on the command line is intentional; one named in an import would block `check` for ever.
     if fs::metadata(&path).is_ok_and(|found| !found.is_file() && !found.is_dir()) {
         return Err("it is a pipe or a device, not a file".into());
     }
-    let bytes = read_bytes(&path)?;
-    Ok((path, bytes))
+    Ok(path)
 }
 
 /// The path without `.` and `folder/..`, so that one file has one name.

@@ -714,3 +714,59 @@ fn signals_of_the_example_are_named_as_in_its_text() {
     assert!(matches!(rig.nodes[2].kind, Kind::Frames(_)));
     assert_eq!(named(3, SignalKind::Field(0, 0)), "panel.enable");
 }
+
+/// A log is a recording: columns by their names, with their units, at the times of the cycles.
+#[test]
+fn a_log_is_data_of_an_experiment() {
+    let folder = folder("hil-data");
+    run(&folder, &["hil", "--sim", "--fast", "--for", "2s", "--log", "a.friclog", &example()], 0);
+    run(&folder, &["replay", "a.friclog", "--csv", "a.csv"], 0);
+    let text = |columns: &str, unit: &str| {
+        format!(
+            "model Held {{\n  input u [{unit}]\n  output y [{unit}] = u\n}}\n\nexperiment played {{\n  \
+             data \"a.friclog\" ({columns})\n  run Held(u = data.u) for 5 s\n  solver rk4 step 1 ms\n  plot y [{unit}]\n}}\n"
+        )
+    };
+    let table = fs::read_to_string(folder.join("a.csv")).unwrap();
+    let mut lines = table.lines();
+    let headings: Vec<&str> = lines.next().unwrap().split(',').collect();
+    let rows: Vec<Vec<&str>> = lines.map(|line| line.split(',').collect()).collect();
+    let column = |name: &str| headings.iter().position(|heading| *heading == name).unwrap();
+    // A reading, a command, and a quantity under `record`, in a unit that is not SI: the same numbers as in the table.
+    for (name, heading, unit) in [
+        ("load.speed", "load.speed", "rad/s"),
+        ("servo.torque permitted", "servo.torque permitted", "N·m"),
+        ("body.v", "body.v [rpm]", "rpm"),
+    ] {
+        fs::write(folder.join("played.fric"), text(&format!("t = \"t\", u [{unit}] = \"{name}\""), unit)).unwrap();
+        run(&folder, &["run", "played.fric", "--data", "played.csv", "--no-error"], 0);
+        let played = fs::read_to_string(folder.join("played.csv")).unwrap();
+        let played: Vec<(f64, f64)> = played
+            .lines()
+            .skip(1)
+            .map(|line| line.split_once(',').map(|(t, y)| (t.parse().unwrap(), y.parse().unwrap())).unwrap())
+            .collect();
+        let (t, u) = (column("t [s]"), column(heading));
+        let mut compared = 0;
+        for row in &rows {
+            let [t, u] = [t, u].map(|at| row[at].parse::<f64>().unwrap());
+            let near = played.iter().find(|(time, _)| (time - t).abs() < 1e-9);
+            if let Some((_, y)) = near {
+                assert!((y - u).abs() <= 1e-6 * u.abs().max(1e-3), "{name} at {t} s: {y} and {u}");
+                compared += i32::from(u != 0.0);
+            }
+        }
+        assert!(compared > 500, "{name}: {compared} values");
+    }
+    // Units of the headings count, and what is not there is said.
+    fs::write(folder.join("wrong.fric"), text("t = \"t\", u [N] = \"load.speed\"", "N")).unwrap();
+    let said = run(&folder, &["check", "wrong.fric"], 1);
+    assert!(said.contains("load.speed") && said.contains("rad/s"), "{said}");
+    fs::write(folder.join("wrong.fric"), text("t = \"t\", u [N] = \"load.sped\"", "N")).unwrap();
+    assert!(run(&folder, &["check", "wrong.fric"], 1).contains("load.sped"));
+    let mut bytes = fs::read(folder.join("a.friclog")).unwrap();
+    let middle = bytes.len() / 2;
+    bytes[middle] ^= 4;
+    fs::write(folder.join("a.friclog"), &bytes).unwrap();
+    assert!(run(&folder, &["check", "played.fric"], 1).contains("damaged at byte"));
+}

@@ -12,8 +12,7 @@ use crate::thin;
 use crate::twin::{Difference, Twin};
 use crate::words::clean;
 use abi::format;
-use abi::rig::{Kind, Rig, SignalKind};
-use abi::unit::{Dimension, Unit};
+use abi::rig::{Rig, SignalKind};
 use abi::{Description, Instance, Slot};
 use runtime::hil::control::{Control, Reading, Source};
 use runtime::hil::trace::{self, Cycle, Shape};
@@ -83,21 +82,6 @@ pub struct Recording {
     last: (Vec<f64>, Vec<u16>),
 }
 
-/// The SI unit of a signal of a node.
-fn unit_of(rig: &Rig, signal: abi::rig::Signal) -> Unit {
-    let named = |name: &str| Unit::parse(name).expect("a known unit");
-    match (signal.what, &rig.nodes[signal.node].kind) {
-        (SignalKind::Torque, _) => named("N·m"),
-        (SignalKind::Speed, _) => named("rad/s"),
-        (SignalKind::Position, _) => named("rad"),
-        (SignalKind::Field(message, field), Kind::Frames(messages)) => {
-            let dimension = messages[message].fields[field].unit.dimension;
-            if dimension == Dimension::NONE { Unit::none() } else { Unit::si(dimension) }
-        }
-        (SignalKind::Enabled | SignalKind::Fault | SignalKind::Limited | SignalKind::Field(..), _) => Unit::none(),
-    }
-}
-
 impl Recording {
     /// An empty recording of a rig. `keep`: bytes of its curves in memory.
     /// `programs`: of control and of the part that the drives replace, at their start.
@@ -109,13 +93,13 @@ impl Recording {
         let mut all: Vec<Signal> = Vec::new();
         for signal in &signals {
             let boolean = matches!(signal.what, SignalKind::Enabled | SignalKind::Fault | SignalKind::Limited);
-            all.push(Signal { label: words::signal(rig, *signal), unit: unit_of(rig, *signal), boolean });
+            all.push(Signal { label: words::signal(rig, *signal), unit: words::unit(rig, *signal), boolean });
         }
         let readings = all.len();
         for output in &rig.outputs {
             for word in ["requested", "permitted"] {
                 let label = format!("{} {word}", words::signal(rig, output.signal));
-                all.push(Signal { label, unit: unit_of(rig, output.signal), boolean: false });
+                all.push(Signal { label, unit: words::unit(rig, output.signal), boolean: false });
             }
         }
         // Readings and commands keep their numbers also where a recorded quantity has the same name.
@@ -252,7 +236,7 @@ impl Recording {
             .zip(&self.last.0)
             .filter(|(output, _)| output.low.is_finite() && output.high.is_finite() && output.low < output.high);
         let commands = commands.map(|(output, value)| {
-            let unit = unit_of(&self.rig, output.signal);
+            let unit = words::unit(&self.rig, output.signal);
             json!({
                 "name": clean(&words::signal(&self.rig, output.signal)),
                 "value": value, "low": output.low, "high": output.high, "unit": unit.text,

@@ -6,6 +6,7 @@ use crate::safety::Cause;
 use abi::Description;
 use abi::format;
 use abi::rig::{Kind, Rig, Signal, SignalKind};
+use abi::unit::{Dimension, Unit};
 use std::fmt::Write;
 
 /// A signal as the text of a rig names it: `load.speed`.
@@ -22,6 +23,21 @@ pub fn signal(rig: &Rig, signal: Signal) -> String {
         (SignalKind::Field(..), Kind::Cia402(_)) => "?",
     };
     format!("{}.{name}", node.name)
+}
+
+/// The SI unit of a signal of a node.
+pub fn unit(rig: &Rig, signal: Signal) -> Unit {
+    let named = |name: &str| Unit::parse(name).expect("a known unit");
+    match (signal.what, &rig.nodes[signal.node].kind) {
+        (SignalKind::Torque, _) => named("N·m"),
+        (SignalKind::Speed, _) => named("rad/s"),
+        (SignalKind::Position, _) => named("rad"),
+        (SignalKind::Field(message, field), Kind::Frames(messages)) => {
+            let dimension = messages[message].fields[field].unit.dimension;
+            if dimension == Dimension::NONE { Unit::none() } else { Unit::si(dimension) }
+        }
+        (SignalKind::Enabled | SignalKind::Fault | SignalKind::Limited | SignalKind::Field(..), _) => Unit::none(),
+    }
 }
 
 /// The reason for a stop. `trouble`: the message of a node, if that was the first cause.
