@@ -900,6 +900,7 @@ pub struct Doctor {
 }
 
 /// What `fric doctor` looks at besides the machine.
+#[cfg_attr(not(all(feature = "hardware", target_os = "linux")), allow(dead_code, reason = "read by `doctor` alone"))]
 #[derive(Clone, Debug)]
 pub enum LookedAt {
     /// The buses of the rigs in a text.

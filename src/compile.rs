@@ -26,7 +26,9 @@ pub use compiler::frontend::names::nearest;
 pub use compiler::frontend::resolve::{Lookup, Space};
 pub use compiler::frontend::system::LINTS;
 use compiler::opt::reassociate;
-pub use compiler::rig::{StepDerivative, bus_load, dbc_messages, linear as linear_of};
+#[cfg(all(feature = "hardware", target_os = "linux"))]
+pub use compiler::rig::dbc_messages;
+pub use compiler::rig::{StepDerivative, bus_load, linear as linear_of};
 pub use compiler::{
     Built, Case, Changes, CompiledRig, Loaded, Options, SourceFile, Sources, adjustable, build, check,
     check_declarations, compile, dissipation, explain, explain_in, explain_rig, explain_run, fit, linear, load,

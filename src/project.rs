@@ -5,7 +5,6 @@
 use runtime::record::blocks;
 use std::fs;
 use std::io::{self, Write};
-use std::os::unix::fs::{DirBuilderExt, OpenOptionsExt};
 use std::path::{Component, Path, PathBuf};
 use std::sync::OnceLock;
 
@@ -242,7 +241,10 @@ pub fn write(path: &Path, bytes: &[u8]) -> io::Result<()> {
 /// Why not, or that the file exists already.
 pub fn write_secret(path: &Path, bytes: &[u8]) -> io::Result<()> {
     if let Some(folder) = path.parent().filter(|folder| !folder.as_os_str().is_empty()) {
-        fs::DirBuilder::new().recursive(true).mode(0o700).create(folder)?;
+        let mut private = fs::DirBuilder::new();
+        #[cfg(unix)]
+        std::os::unix::fs::DirBuilderExt::mode(&mut private, 0o700);
+        private.recursive(true).create(folder)?;
     }
     if fs::symlink_metadata(path).is_ok() {
         return Err(io::ErrorKind::AlreadyExists.into());
@@ -256,10 +258,14 @@ fn replace(path: &Path, bytes: &[u8], mode: u32, permissions: Option<fs::Permiss
     let neighbour = path.with_file_name(format!(".{name}.{}", std::process::id()));
     // A file of that name was left by a killed process, or is a symbolic link set as a trap: never write through it.
     let _ = fs::remove_file(&neighbour);
-    let written = fs::OpenOptions::new()
-        .write(true)
-        .create_new(true)
-        .mode(mode)
+    let mut options = fs::OpenOptions::new();
+    options.write(true).create_new(true);
+    // Elsewhere a file has the permissions of its folder; those of a user's own folders exclude other users.
+    #[cfg(unix)]
+    std::os::unix::fs::OpenOptionsExt::mode(&mut options, mode);
+    #[cfg(not(unix))]
+    let _ = mode;
+    let written = options
         .open(&neighbour)
         .and_then(|mut file| file.write_all(bytes).and_then(|()| file.sync_all()))
         .and_then(|()| permissions.map_or(Ok(()), |permissions| fs::set_permissions(&neighbour, permissions)))
@@ -271,6 +277,7 @@ fn replace(path: &Path, bytes: &[u8], mode: u32, permissions: Option<fs::Permiss
 }
 
 #[cfg(test)]
+#[cfg(unix)]
 mod tests {
     use super::*;
     use std::os::unix::fs::{MetadataExt, PermissionsExt};

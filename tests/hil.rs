@@ -42,7 +42,7 @@ fn rig_in(file: &str, text: &str, rig: &str, set: &[&str]) -> CompiledRig {
 
 fn started(ready: CompiledRig, seconds: f64) -> (Hil, World, Rig) {
     let CompiledRig { rig, control, plant, .. } = ready;
-    let look = runtime::hil::cycle::look_ahead(&rig, &plant).unwrap();
+    let look = runtime::hil::coupling::look_ahead(&rig, &plant).unwrap();
     let mut world = World::new(&rig, Some(plant), Pace::Fast, 1).unwrap();
     let duration_ns = Some((seconds * 1e9) as u64);
     let options = HilOptions { arms_itself: true, duration_ns, look, ..HilOptions::default() };
@@ -204,7 +204,7 @@ fn pulled(rig: &str, delay_ms: f64, known: bool) -> (Vec<f64>, u32) {
     if !known {
         seen.plant.applied.retain(|(signal, _)| signal.node == 0);
     }
-    let look = runtime::hil::cycle::look_ahead(&seen, &made.plant).unwrap();
+    let look = runtime::hil::coupling::look_ahead(&seen, &made.plant).unwrap();
     let mut world = World::new(&made.rig, Some(made.plant), Pace::Fast, 1).unwrap();
     let mut options =
         HilOptions { arms_itself: true, duration_ns: Some(20_000_000_000), look, ..HilOptions::default() };

@@ -2,7 +2,8 @@
 //! that are declared above it, at every level of folders, and each outside crate has one home.
 //!
 //! Sources are parsed (syn), so `crate::`, `super::` and `self::` paths count alike, in code and in macros. Only items
-//! under `#[cfg(test)]` are left out.
+//! under `#[cfg(test)]` are left out. The same sources say what only Linux or Unix has under a `cfg` alone, so that the
+//! rest builds on other systems.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -64,6 +65,7 @@ const HOMES: &[(&str, &[&str])] = &[
     ("rustyline", &["src/repl/line.rs"]),
     ("rustc-hash", &["compiler/src/ir/hash.rs"]),
     // JSON is a form of every command's results, and what the page of a panel reads.
+    ("same-file", &["runtime/src/record/claim.rs"]),
     ("serde_json", &["src/", "panel/src/"]),
     ("sha2", &["abi/src/image.rs"]),
     ("socketcan", &["runtime/src/can/socketcan.rs"]),
@@ -312,8 +314,10 @@ fn outside_crates_have_one_home() {
     let homes: BTreeMap<&str, &[&str]> = HOMES.iter().copied().collect();
     let mut used: BTreeSet<&str> = BTreeSet::new();
     for (name, entry, _) in CRATES {
-        let named =
-            dependencies(&manifest(entry), &["dependencies", "target.'cfg(target_os = \"linux\")'.dependencies"]);
+        let named = dependencies(
+            &manifest(entry),
+            &["dependencies", "target.'cfg(target_os = \"linux\")'.dependencies", "target.'cfg(unix)'.dependencies"],
+        );
         let source = source(entry);
         for outside in named.iter().filter(|outside| !ours.contains(&outside.as_str())) {
             let (known, homes) = homes.get_key_value(outside.as_str()).unwrap_or_else(|| {
@@ -334,4 +338,120 @@ fn outside_crates_have_one_home() {
     }
     let idle: Vec<&&str> = homes.keys().filter(|home| !used.contains(**home)).collect();
     assert!(idle.is_empty(), "no crate depends on {idle:?}");
+}
+
+/// What not every system has.
+const OF_LINUX: &[&str] = &["libc", "socketcan", "rustix", "std::os::unix", "std::os::fd", "std::os::linux"];
+
+/// Whether a `cfg` restricts what it is on to systems that have it.
+fn is_restricted(attributes: &[syn::Attribute]) -> bool {
+    attributes.iter().any(|attribute| {
+        let syn::Meta::List(list) = &attribute.meta else { return false };
+        let condition = list.tokens.to_string();
+        let restricting = ["unix", "test", "all (feature = \"hardware\" , target_os = \"linux\")"];
+        list.path.is_ident("cfg") && restricting.contains(&condition.as_str())
+    })
+}
+
+/// Collects the paths of [`OF_LINUX`] that a file names without such a `cfg`.
+#[derive(Default)]
+struct Unrestricted(Vec<String>);
+
+impl Unrestricted {
+    fn path(&mut self, path: &str) {
+        let inside = |name: &&str| path == *name || path.strip_prefix(*name).is_some_and(|rest| rest.starts_with("::"));
+        if OF_LINUX.iter().any(inside) {
+            self.0.push(path.to_string());
+        }
+    }
+
+    fn tree(&mut self, tree: &syn::UseTree, before: &str) {
+        let with = |name: &syn::Ident| if before.is_empty() { name.to_string() } else { format!("{before}::{name}") };
+        match tree {
+            syn::UseTree::Path(path) => self.tree(&path.tree, &with(&path.ident)),
+            syn::UseTree::Name(name) => self.path(&with(&name.ident)),
+            syn::UseTree::Rename(name) => self.path(&with(&name.ident)),
+            syn::UseTree::Glob(_) => self.path(before),
+            syn::UseTree::Group(group) => group.items.iter().for_each(|item| self.tree(item, before)),
+        }
+    }
+}
+
+/// Visits what carries no restricting attribute.
+macro_rules! where_unrestricted {
+    ($($visit:ident: $node:ident),*) => {
+        $(fn $visit(&mut self, node: &'a syn::$node) {
+            if !is_restricted(&node.attrs) {
+                syn::visit::$visit(self, node);
+            }
+        })*
+    };
+}
+
+impl<'a> Visit<'a> for Unrestricted {
+    where_unrestricted! {
+        visit_item_fn: ItemFn, visit_item_mod: ItemMod, visit_item_const: ItemConst, visit_item_type: ItemType,
+        visit_item_struct: ItemStruct, visit_item_enum: ItemEnum, visit_item_impl: ItemImpl,
+        visit_impl_item_fn: ImplItemFn, visit_local: Local, visit_arm: Arm, visit_expr_call: ExprCall,
+        visit_expr_method_call: ExprMethodCall, visit_expr_return: ExprReturn, visit_expr_block: ExprBlock,
+        visit_field: Field
+    }
+
+    fn visit_item_use(&mut self, item: &'a syn::ItemUse) {
+        if !is_restricted(&item.attrs) {
+            self.tree(&item.tree, "");
+        }
+    }
+
+    fn visit_path(&mut self, path: &'a syn::Path) {
+        let words: Vec<String> = path.segments.iter().map(|segment| segment.ident.to_string()).collect();
+        self.path(&words.join("::"));
+        syn::visit::visit_path(self, path);
+    }
+}
+
+/// The files of a crate's modules, without those under a restricting `cfg`.
+fn unrestricted_files(file: &Path, found: &mut Vec<PathBuf>) {
+    let text = fs::read_to_string(file).unwrap_or_else(|why| panic!("{}: {why}", file.display()));
+    let parsed = syn::parse_file(&text).unwrap_or_else(|why| panic!("{}: {why}", file.display()));
+    let is_folder = matches!(file.file_name().and_then(|name| name.to_str()), Some("lib.rs" | "main.rs" | "mod.rs"));
+    let folder = if is_folder { file.parent().expect("a folder").to_path_buf() } else { file.with_extension("") };
+    found.push(file.to_path_buf());
+    for item in &parsed.items {
+        let syn::Item::Mod(module) = item else { continue };
+        if module.content.is_some() || is_restricted(&module.attrs) {
+            continue;
+        }
+        let candidates =
+            [folder.join(format!("{}.rs", module.ident)), folder.join(module.ident.to_string()).join("mod.rs")];
+        let path = candidates.iter().find(|path| path.is_file()).expect("each module has a file");
+        unrestricted_files(path, found);
+    }
+}
+
+/// `fric-rig` runs on the computer of a rig, which has Linux; all else builds without it.
+#[test]
+fn only_the_feature_hardware_needs_linux() {
+    let unrestricted = |text: &str| {
+        let mut found = Unrestricted::default();
+        found.visit_file(&syn::parse_file(text).expect("a file"));
+        found.0
+    };
+    // The mistakes that it is for are found, and what a `cfg` restricts is not.
+    assert_eq!(unrestricted("use std::os::unix::fs::{DirBuilderExt, OpenOptionsExt};").len(), 2);
+    assert_eq!(unrestricted("fn f() -> libc::c_int { match 0 { 0 => rustix::fs::x(), _ => 1 } }").len(), 2);
+    assert_eq!(unrestricted("fn f() { #[cfg(unix)] std::os::unix::x(1); #[cfg(windows)] libc::y(); }"), ["libc::y"]);
+    assert!(unrestricted("#[cfg(unix)] fn f() { libc::y() } mod libc_of_ours {}").is_empty());
+    let mut files = Vec::new();
+    for (_, entry, _) in CRATES.iter().filter(|(name, ..)| *name != "fric-rig") {
+        unrestricted_files(&root().join(entry), &mut files);
+    }
+    assert!(files.len() > 200, "{} files", files.len());
+    let mut wrong = Vec::new();
+    for file in files {
+        let text = fs::read_to_string(&file).expect("it was just read");
+        let named = unrestricted(&text);
+        wrong.extend(named.iter().map(|path| format!("{}: {path}", file.display())));
+    }
+    assert!(wrong.is_empty(), "without `cfg(unix)` or the feature `hardware`:\n{}", wrong.join("\n"));
 }

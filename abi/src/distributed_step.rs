@@ -12,9 +12,11 @@ use std::any::Any;
 use std::mem::MaybeUninit;
 use std::sync::Arc;
 
-/// Machine code of the remaining part: as [`Entry`](crate::table::Entry), for `count` steps. `ahead` holds the values
-/// computed ahead: value `k` of step `i` is `ahead[k · lanes + i]`.
-pub type RemainingEntry = unsafe extern "C" fn(block: *mut f64, pool: *const f64, count: u64, ahead: *const f64) -> u64;
+compiled! {
+    /// Machine code of the remaining part: as an entry of a table, for `count` steps. `ahead` holds the values
+    /// computed ahead: value `k` of step `i` is `ahead[k · lanes + i]`.
+    pub type RemainingEntry = fn(block: *mut f64, pool: *const f64, count: u64, ahead: *const f64);
+}
 
 /// Capacity of the stack buffer, in numbers: 32 KiB.
 const ROOM: usize = 4096;

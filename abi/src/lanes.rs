@@ -6,13 +6,15 @@ use std::any::Any;
 use std::ops::Range;
 use std::sync::Arc;
 
-/// Machine code that advances all lanes by up to `count` fixed steps, and by at least one if `count` is not 0. It stops
-/// no later than after a step at which the status of a lane is not 0. Returns the number of steps done; `statuses`
-/// receives the status of each lane after the last step.
-///
-/// The values of a slot are adjacent: `block[slot · width + lane]`. The code has scratch space after the slots. Block
-/// and statuses are aligned to 64 bytes.
-pub type LanesEntry = unsafe extern "C" fn(block: *mut f64, pool: *const f64, count: u64, statuses: *mut u64) -> u64;
+compiled! {
+    /// Machine code that advances all lanes by up to `count` fixed steps, and by at least one if `count` is not 0. It stops
+    /// no later than after a step at which the status of a lane is not 0. Returns the number of steps done; `statuses`
+    /// receives the status of each lane after the last step.
+    ///
+    /// The values of a slot are adjacent: `block[slot · width + lane]`. The code has scratch space after the slots. Block
+    /// and statuses are aligned to 64 bytes.
+    pub type LanesEntry = fn(block: *mut f64, pool: *const f64, count: u64, statuses: *mut u64);
+}
 
 /// The step of a model, for many instances at once.
 #[derive(Clone)]

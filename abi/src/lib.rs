@@ -4,6 +4,20 @@
 //! All numbers of a model are in one flat block of `f64`, addressed by [`Slot`]s. Every function of the model reads and
 //! writes that block and nothing else. Knows neither the language nor any solver.
 
+/// Declares a type of functions in compiled code. On x86-64 they have the calling convention of the System V ABI, on
+/// Windows too: the code is the same on all systems.
+macro_rules! compiled {
+    ($(#[$attribute:meta])* pub type $name:ident = fn($($argument:ident: $type:ty),*);) => {
+        $(#[$attribute])*
+        #[cfg(not(all(windows, target_arch = "x86_64")))]
+        pub type $name = unsafe extern "C" fn($($argument: $type),*) -> u64;
+
+        $(#[$attribute])*
+        #[cfg(all(windows, target_arch = "x86_64"))]
+        pub type $name = unsafe extern "sysv64" fn($($argument: $type),*) -> u64;
+    };
+}
+
 pub mod random;
 pub mod unit;
 pub mod format;

@@ -59,11 +59,13 @@ impl Function {
     }
 }
 
-/// Machine code of one function: runs it up to `count` times on the block, stops at the first non-zero status and
-/// returns it (0: none). `pool`: the description's pool of constants. A call for one fixed step need not store the step
-/// count if nothing else depends on it, and no call need store time if no equation reads it. The caller stores these
-/// with [`keep_clock`].
-pub type Entry = unsafe extern "C" fn(block: *mut f64, pool: *const f64, count: u64) -> u64;
+compiled! {
+    /// Machine code of one function: runs it up to `count` times on the block, stops at the first non-zero status and
+    /// returns it (0: none). `pool`: the description's pool of constants. A call for one fixed step need not store the step
+    /// count if nothing else depends on it, and no call need store time if no equation reads it. The caller stores these
+    /// with [`keep_clock`].
+    pub type Entry = fn(block: *mut f64, pool: *const f64, count: u64);
+}
 
 /// Stores the step count and time after a call for `count` fixed steps, at least one. The code itself has stored the
 /// count if it was called for more than one step. `before`: the count before the call.

@@ -7,7 +7,7 @@ use crate::server::Bell;
 use abi::Instance;
 use abi::rig::Rig;
 use runtime::hil::control::Control;
-use runtime::hil::cycle::look_ahead;
+use runtime::hil::coupling::look_ahead;
 use runtime::hil::trace;
 use runtime::record::blocks::End;
 use runtime::record::log::{Reader, Sections};

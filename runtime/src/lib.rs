@@ -30,6 +30,7 @@ pub mod realtime;
 
 pub mod can;
 
+#[cfg(all(feature = "hardware", target_os = "linux"))]
 pub mod latency_test;
 
 pub mod safety;

@@ -16,7 +16,6 @@ use runtime::package::{MOST_BYTES, Package, hash};
 use runtime::record::parts;
 use std::fs;
 use std::io::IsTerminal;
-use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 
@@ -112,7 +111,7 @@ fn signing(args: &Deploy, terminal: &mut Terminal) -> Result<Option<Named>, Stri
         return Ok(None);
     }
     let variable = |name: &str| std::env::var_os(name).filter(|value| !value.is_empty()).map(PathBuf::from);
-    let folder = variable("XDG_CONFIG_HOME").or_else(|| variable("HOME").map(|home| home.join(".config")));
+    let folder = variable("XDG_CONFIG_HOME").or_else(|| std::env::home_dir().map(|home| home.join(".config")));
     let folder = folder.ok_or("no home to keep a key in: name one with --sign, `fric key new` makes it")?.join("fric");
     let path = folder.join("deploy.key");
     if !path.exists() {
@@ -262,8 +261,11 @@ struct Staging {
 
 impl Staging {
     fn new(name: &str, bytes: &[u8], signature: Option<&str>) -> Result<Staging, String> {
-        let private = fs::Permissions::from_mode(0o700);
-        let folder = tempfile::Builder::new().prefix("fric-deploy-").permissions(private).tempdir();
+        let mut private = tempfile::Builder::new();
+        private.prefix("fric-deploy-");
+        #[cfg(unix)]
+        private.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o700));
+        let folder = private.tempdir();
         let folder = folder.map_err(|error| format!("no folder for the package: {error}"))?;
         let mut paths = Vec::new();
         let beside = format!("{name}.{SIGNATURE}");

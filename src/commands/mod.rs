@@ -1,20 +1,27 @@
 //! The commands, one file each. A command prints its results and returns how it ended.
 
 mod bench;
+#[cfg(all(feature = "hardware", target_os = "linux"))]
 mod bench_rt;
 mod shared;
 mod build;
+#[cfg(all(feature = "hardware", target_os = "linux"))]
 mod bus;
 mod characterise;
 mod check;
 mod deploy;
 mod doc;
+#[cfg(all(feature = "hardware", target_os = "linux"))]
 mod doctor;
+#[cfg(all(feature = "hardware", target_os = "linux"))]
 mod drives;
 mod explain;
 mod fmt;
+#[cfg(all(feature = "hardware", target_os = "linux"))]
 mod beside;
+#[cfg(all(feature = "hardware", target_os = "linux"))]
 mod prompt;
+#[cfg(all(feature = "hardware", target_os = "linux"))]
 mod hil;
 mod inspect;
 mod key;
@@ -45,7 +52,14 @@ use shared::progress;
 use std::path::Path;
 use std::time::Instant;
 
+/// Why a command is missing.
+#[cfg(not(all(feature = "hardware", target_os = "linux")))]
+const NEEDS_HARDWARE: &str = "this build has no real buses and clocks, which this command needs\n  \
+    mend: run it on Linux, in a build with the feature `hardware`, which is on by default there; check, predict, build, \
+    deploy and replay work here too";
+
 /// How a command ended.
+#[cfg_attr(not(all(feature = "hardware", target_os = "linux")), allow(dead_code, reason = "only a rig is stopped"))]
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum End {
     /// Exit code 0.
@@ -79,6 +93,7 @@ pub fn run(args: &Args, begin: Instant, terminal: &mut Terminal) -> End {
         Command::Linearise(linearise) => linearise::linearise(linearise, terminal),
         Command::Bench(args) => bench::bench(args, terminal),
         Command::Build(build) => build::build(build, terminal),
+        #[cfg(all(feature = "hardware", target_os = "linux"))]
         Command::Hil(args) => hil::hil(args, terminal),
         Command::Predict(args) => predict::predict(args, terminal),
         Command::Replay(args) => replay::replay(args, terminal),
@@ -93,6 +108,7 @@ pub fn run(args: &Args, begin: Instant, terminal: &mut Terminal) -> End {
         Command::Characterise(args) => characterise::characterise(args, terminal),
         Command::Compare(args) => characterise::compare(args, terminal),
         Command::Doc(args) => doc::doc(args, terminal),
+        #[cfg(all(feature = "hardware", target_os = "linux"))]
         Command::Drives(args) => drives::drives(args, terminal),
         Command::Repl(args) => repl::repl(args, terminal),
         Command::Watch(args) => watch::watch(args, terminal),
@@ -101,9 +117,17 @@ pub fn run(args: &Args, begin: Instant, terminal: &mut Terminal) -> End {
         Command::Key { command: Key::New(args) } => key::new(args, terminal),
         Command::Deploy(args) => deploy::deploy(args, terminal),
         Command::FetchLog(args) => deploy::fetch_log(args, terminal),
+        #[cfg(all(feature = "hardware", target_os = "linux"))]
         Command::Bus(args) => bus::bus(args, terminal),
+        #[cfg(all(feature = "hardware", target_os = "linux"))]
         Command::Doctor(args) => doctor::doctor(args, terminal),
+        #[cfg(all(feature = "hardware", target_os = "linux"))]
         Command::BenchRt(args) => bench_rt::bench_rt(args, terminal),
+        #[cfg(not(all(feature = "hardware", target_os = "linux")))]
+        Command::Hil(_) | Command::Drives(_) | Command::Bus(_) | Command::Doctor(_) | Command::BenchRt(_) => {
+            terminal.error(NEEDS_HARDWARE);
+            End::Misused
+        }
         Command::New(new) => new::new(new, terminal),
         Command::Completions { shell } => {
             terminal.print(&args::completions(*shell));

@@ -117,7 +117,7 @@ fn make_folder(path: &std::path::Path) -> Result<(), ()> {
 /// `$XDG_STATE_HOME/fric/history`, else `~/.local/state/fric/history`.
 fn history_file() -> Option<PathBuf> {
     let absolute = |name: &str| std::env::var_os(name).map(PathBuf::from).filter(|path| path.is_absolute());
-    let state = absolute("XDG_STATE_HOME").or_else(|| Some(absolute("HOME")?.join(".local").join("state")))?;
+    let state = absolute("XDG_STATE_HOME").or_else(|| Some(std::env::home_dir()?.join(".local").join("state")))?;
     Some(state.join("fric").join("history"))
 }
 

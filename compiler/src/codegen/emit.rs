@@ -16,12 +16,17 @@ use cranelift_codegen::ir::{
     self as clif, AbiParam, BlockArg, ExtFuncData, InstBuilder, MemFlagsData, Signature, StackSlotData, StackSlotKind,
     UserExternalName, types,
 };
-use cranelift_codegen::isa::TargetIsa;
+use cranelift_codegen::isa::{CallConv, TargetIsa};
 use cranelift_frontend::{FunctionBuilder, FunctionBuilderContext};
+
+/// The calling convention of [`abi::table::Entry`]: on x86-64 that of the System V ABI, on Windows too.
+fn calling_convention(isa: &dyn TargetIsa) -> CallConv {
+    if isa.name() == "x64" { CallConv::SystemV } else { isa.default_call_conv() }
+}
 
 /// The signature of [`abi::table::Entry`].
 pub fn signature(isa: &dyn TargetIsa) -> Signature {
-    let mut signature = Signature::new(isa.default_call_conv());
+    let mut signature = Signature::new(calling_convention(isa));
     signature.params.extend([types::I64; 3].map(AbiParam::new));
     signature.returns.push(AbiParam::new(types::I64));
     signature
@@ -29,7 +34,7 @@ pub fn signature(isa: &dyn TargetIsa) -> Signature {
 
 /// The signature of a piece: addresses of block, pool and scratch area.
 fn signature_of_piece(isa: &dyn TargetIsa) -> Signature {
-    let mut signature = Signature::new(isa.default_call_conv());
+    let mut signature = Signature::new(calling_convention(isa));
     signature.params.extend([types::I64; 3].map(AbiParam::new));
     signature
 }

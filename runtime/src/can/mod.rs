@@ -6,24 +6,34 @@ pub mod cob_ids;
 pub mod frame_length;
 
 pub mod address;
+#[cfg(all(feature = "hardware", target_os = "linux"))]
 pub mod descriptor;
+#[cfg(all(feature = "hardware", target_os = "linux"))]
 mod text_stream;
 
 pub mod sim;
 
+#[cfg(all(feature = "hardware", target_os = "linux"))]
 pub mod slcan;
+#[cfg(all(feature = "hardware", target_os = "linux"))]
 pub mod socketcan;
+#[cfg(all(feature = "hardware", target_os = "linux"))]
 pub mod socketcand;
 
 pub mod log;
 pub mod replay;
 
+#[cfg(all(feature = "hardware", target_os = "linux"))]
 pub mod bridge;
 
+#[cfg(all(feature = "hardware", target_os = "linux"))]
 use address::Address;
+#[cfg(all(feature = "hardware", target_os = "linux"))]
 use sim::{Join, Simulation};
 use std::fmt;
-use std::os::fd::RawFd;
+
+/// A file descriptor of the operating system, as in the standard library of Unix systems.
+pub type Descriptor = i32;
 
 /// One classical CAN frame.
 #[derive(Clone, Copy, PartialEq, Eq, Hash)]
@@ -233,7 +243,7 @@ pub trait Bus {
     fn health(&self) -> Health;
 
     /// A descriptor that becomes readable when something has arrived; none where no kernel is involved.
-    fn descriptor(&self) -> Option<RawFd> {
+    fn descriptor(&self) -> Option<Descriptor> {
         None
     }
 
@@ -248,13 +258,14 @@ pub trait Bus {
 /// A frame as bytes for one write(2). Valid as long as the bus that made it.
 #[derive(Clone, Copy, Debug)]
 pub struct Prepared {
-    fd: RawFd,
+    fd: Descriptor,
     bytes: [u8; 64],
     length: u8,
 }
 
 impl Prepared {
-    pub(crate) fn new(fd: RawFd, from: &[u8]) -> Prepared {
+    #[cfg(all(feature = "hardware", target_os = "linux"))]
+    pub(crate) fn new(fd: Descriptor, from: &[u8]) -> Prepared {
         let mut bytes = [0; 64];
         bytes[..from.len()].copy_from_slice(from);
         Prepared { fd, bytes, length: from.len() as u8 }
@@ -263,7 +274,10 @@ impl Prepared {
     /// Sends the frame: one async-signal-safe system call, no allocation, no lock. False if it was refused.
     pub fn send(&self) -> bool {
         let bytes = &self.bytes[..usize::from(self.length)];
-        descriptor::write(self.fd, bytes) == descriptor::Moved::Bytes(bytes.len())
+        #[cfg(all(feature = "hardware", target_os = "linux"))]
+        return descriptor::write(self.fd, bytes) == descriptor::Moved::Bytes(bytes.len());
+        #[cfg(not(all(feature = "hardware", target_os = "linux")))]
+        unreachable!("no bus of this build has the descriptor {} for {bytes:02X?}", self.fd);
     }
 }
 
@@ -299,12 +313,14 @@ impl fmt::Display for CannotOpen {
 }
 
 /// Default bit rate of a simulated bus, bits per second.
+#[cfg(all(feature = "hardware", target_os = "linux"))]
 const BIT_RATE: u32 = 1_000_000;
 
 /// Opens a bus of any kind. `name`: name of our node on a simulated bus.
 ///
 /// Real buses use the clock of `world` for timestamps, which must therefore be a real clock: a simulated one cannot
 /// wait for them.
+#[cfg(all(feature = "hardware", target_os = "linux"))]
 pub fn open(address: &Address, options: &Options, world: &Simulation, name: &str) -> Result<Box<dyn Bus>, CannotOpen> {
     let clock = || {
         world.monotonic().ok_or_else(|| CannotOpen {

@@ -19,6 +19,7 @@ pub mod fault_injection;
 pub mod simulated;
 pub mod simulated_plant;
 pub mod bus_stub;
+#[cfg(all(feature = "hardware", target_os = "linux"))]
 pub mod serve;
 
 pub use crate::drive::bus_stub::attend;

@@ -5,7 +5,8 @@
 //! that of the drive. After every stop no drive is under torque.
 
 use super::control;
-use super::cycle::{Command, End, Hil, Operator, Options, look_ahead};
+use super::coupling::look_ahead;
+use super::cycle::{Command, End, Hil, Operator, Options};
 use super::live::Set;
 use super::simulated::{BENCH, MASTER, Pace, World};
 use crate::can::sim::{BusFaultKind as FaultKind, Fault, Port};

@@ -6,7 +6,8 @@
 //! additional state. `FRIC_SEED=n` repeats one seed; `FRIC_RUNS=n` sets their number.
 
 use super::campaign::quick;
-use super::cycle::{End, Hil, look_ahead};
+use super::coupling::look_ahead;
+use super::cycle::{End, Hil};
 use super::simulated::{Pace, World};
 use crate::drive::Step;
 use crate::drive::fault_injection::{Effect, Hook, Start};

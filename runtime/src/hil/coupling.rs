@@ -6,6 +6,7 @@
 
 use crate::coupling::passivity::{Energy, Sign};
 use crate::coupling::predictor::{Predicted, Wired};
+use crate::drive::timing;
 use crate::safety::{Protection, is_present};
 use abi::rig::{Kind, Mode, Rig, Signal, SignalKind};
 use abi::{Instance, Slot};
@@ -35,6 +36,15 @@ pub enum CouplingVerdict {
     Drives,
     /// The shaft deviates from its model, and without the predictor the loop is unstable.
     Unpredictable,
+}
+
+/// Creates the predictor that the rig's `predict` requires, with the delays of its loop. `plant`: the program of the
+/// part of the model that hardware replaces.
+///
+/// # Errors
+/// A message about what the predictor lacks.
+pub fn look_ahead(rig: &Rig, plant: &Instance) -> Result<Option<Wired>, String> {
+    Wired::of(rig, plant, |node| timing::transit_ns(rig, node))
 }
 
 /// A contact that a drive plays, characterised by a slow motion.

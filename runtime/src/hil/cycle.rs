@@ -55,17 +55,8 @@ pub struct Options {
     pub collect_ns: Option<u64>,
     /// Time for which the model runs, ns; none: until an operator stops it.
     pub duration_ns: Option<u64>,
-    /// The predictor that the rig's `predict` requires: [`look_ahead`].
+    /// The predictor that the rig's `predict` requires: [`look_ahead`](super::coupling::look_ahead).
     pub look: Option<Wired>,
-}
-
-/// Creates the predictor that the rig's `predict` requires, with the delays of this loop. `plant`: the program of the
-/// part of the model that hardware replaces.
-///
-/// # Errors
-/// A message about what the predictor lacks.
-pub fn look_ahead(rig: &Rig, plant: &Instance) -> Result<Option<Wired>, String> {
-    Wired::of(rig, plant, |node| timing::transit_ns(rig, node))
 }
 
 /// How a run ended.

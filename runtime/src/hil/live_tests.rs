@@ -3,7 +3,8 @@
 
 use super::campaign::quick;
 use super::control;
-use super::cycle::{Hil, Options, look_ahead};
+use super::coupling::look_ahead;
+use super::cycle::{Hil, Options};
 use super::live::{Judge, Objection, Set};
 use super::operator::{Answer, Command, Mark, Operator, PLACES, Reason, Stamp, Ticket};
 use super::simulated::{Pace, World};

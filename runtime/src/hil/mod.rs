@@ -11,15 +11,21 @@ pub mod control;
 pub mod live;
 pub mod trace;
 pub mod replay;
+#[cfg(all(feature = "hardware", target_os = "linux"))]
 pub mod emergency;
+#[cfg(all(feature = "hardware", target_os = "linux"))]
 mod wires;
 pub mod counts;
 pub mod words;
 pub mod stage;
+#[cfg(all(feature = "hardware", target_os = "linux"))]
 pub mod operator;
+#[cfg(all(feature = "hardware", target_os = "linux"))]
 pub mod cycle;
+#[cfg(all(feature = "hardware", target_os = "linux"))]
 pub mod identify;
 pub mod simulated;
+#[cfg(all(feature = "hardware", target_os = "linux"))]
 pub mod session;
 
 #[cfg(test)]

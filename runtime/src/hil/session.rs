@@ -3,7 +3,8 @@
 //! In: a rig, its programs, a clock and buses. Out: a cycle on a real-time thread with its watchdog, and after its end
 //! the closed log. Knows neither arguments nor the terminal: its messages are returned.
 
-use super::cycle::{End, Hil, Options, look_ahead};
+use super::coupling::look_ahead;
+use super::cycle::{End, Hil, Options};
 use super::emergency::{self, Watchdog};
 use super::live::Judge;
 use super::operator::Operator;

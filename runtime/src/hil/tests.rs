@@ -1,7 +1,8 @@
 //! Tests of a whole rig in simulated time: start, run, stop, log and replay.
 
 use super::control::Control;
-use super::cycle::{End, Hil, Options, look_ahead};
+use super::coupling::look_ahead;
+use super::cycle::{End, Hil, Options};
 use super::replay::{Replay, Stopped};
 use super::simulated::{Pace, World};
 use super::trace;

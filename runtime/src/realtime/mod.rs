@@ -2,5 +2,7 @@
 
 pub mod clock;
 pub mod histogram;
+#[cfg(all(feature = "hardware", target_os = "linux"))]
 pub mod threads;
+#[cfg(all(feature = "hardware", target_os = "linux"))]
 pub mod host_check;

@@ -4,9 +4,9 @@
 //! or removed meanwhile, a lock file beside it is locked. The operating system releases the lock however the process
 //! ends.
 
+use same_file::Handle;
 use std::fs::{self, File, OpenOptions, TryLockError};
 use std::io;
-use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
 /// Opens a file, created if missing, and locks it; none if another process has locked it.
@@ -23,8 +23,8 @@ pub fn open_alone(path: &Path) -> io::Result<Option<File>> {
         }
         // A process that has ended meanwhile may have removed its lock file: a lock on the removed file excludes
         // nobody.
-        let ours = file.metadata()?;
-        if fs::metadata(path).is_ok_and(|there| (there.dev(), there.ino()) == (ours.dev(), ours.ino())) {
+        let ours = Handle::from_file(file.try_clone()?)?;
+        if Handle::from_path(path).is_ok_and(|there| there == ours) {
             return Ok(Some(file));
         }
     }

@@ -186,9 +186,19 @@ pub fn remove_oldest(current: &Path, keep: u64) -> io::Result<u64> {
 ///
 /// # Errors
 /// Those of the operating system.
+#[cfg(unix)]
 pub fn free(path: &Path) -> io::Result<u64> {
     let disk = rustix::fs::statvfs(path)?;
     Ok(disk.f_bavail * disk.f_frsize)
+}
+
+/// Rigs, which write logs, run on Linux.
+///
+/// # Errors
+/// Always: the number is unknown here.
+#[cfg(not(unix))]
+pub fn free(_: &Path) -> io::Result<u64> {
+    Err(io::ErrorKind::Unsupported.into())
 }
 
 #[cfg(test)]

@@ -5,7 +5,11 @@ use std::path::Path;
 use std::process::{Command, Stdio};
 
 /// The program that opens files, unless `FRIC_OPENER` names another.
-const OPENER: &str = if cfg!(target_os = "macos") { "open" } else { "xdg-open" };
+const OPENER: &str = match () {
+    () if cfg!(target_os = "macos") => "open",
+    () if cfg!(windows) => "explorer",
+    () => "xdg-open",
+};
 
 /// Opens a file, without waiting for the program that shows it. A failure is reported: the file is written anyway.
 pub(in crate::commands) fn open(path: &Path, terminal: &Terminal) {

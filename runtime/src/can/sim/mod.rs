@@ -15,12 +15,20 @@
 mod fault;
 mod line;
 
-use super::{Bus, Filter, Frame, Health, Received, Refused, descriptor};
+use super::{Bus, Filter, Frame, Health, Received, Refused};
 use crate::realtime::clock::{Clock, Monotonic, Simulated};
 pub use fault::{BusFaultKind, Fault};
 use line::Wire;
 use std::cell::{Cell, RefCell};
 use std::rc::Rc;
+
+/// A descriptor of a real bus to wait for beside the simulation.
+#[cfg(all(feature = "hardware", target_os = "linux"))]
+pub type Polled = libc::pollfd;
+
+/// A descriptor of a real bus to wait for beside the simulation: this build has none.
+#[cfg(not(all(feature = "hardware", target_os = "linux")))]
+pub enum Polled {}
 
 /// An independent simulation: one clock, its buses and its actors. Clones are handles of the same simulation.
 #[derive(Clone)]
@@ -102,7 +110,7 @@ impl Simulation {
 
     /// Executes everything that is due, then waits for the next event: on a bus, of an actor, at one of the
     /// descriptors, or the time `until_ns`. Simulated time does not wait for descriptors.
-    pub fn step(&self, until_ns: u64, watched: &mut [libc::pollfd]) {
+    pub fn step(&self, until_ns: u64, watched: &mut [Polled]) {
         self.0.step(until_ns, watched, || false);
     }
 
@@ -145,7 +153,7 @@ impl World {
 
     /// Lets all actors act at the present time. Then advances to the next event, unless `enough` returns true or the
     /// time is reached. Returns true if it did not advance.
-    fn step(&self, until_ns: u64, watched: &mut [libc::pollfd], enough: impl Fn() -> bool) -> bool {
+    fn step(&self, until_ns: u64, watched: &mut [Polled], enough: impl Fn() -> bool) -> bool {
         let now_ns = self.now_ns();
         let buses = self.buses.borrow();
         buses.iter().for_each(|bus| bus.line.borrow_mut().run_to(now_ns, false));
@@ -167,7 +175,10 @@ impl World {
         match &self.time {
             Time::Simulated(clock) => clock.advance_to(next_ns),
             Time::Real(clock) if watched.is_empty() => clock.sleep_until(next_ns),
-            Time::Real(clock) => drop(descriptor::wait(watched, clock, next_ns)),
+            #[cfg(all(feature = "hardware", target_os = "linux"))]
+            Time::Real(clock) => drop(super::descriptor::wait(watched, clock, next_ns)),
+            #[cfg(not(all(feature = "hardware", target_os = "linux")))]
+            Time::Real(_) => unreachable!("`Polled` has no values"),
         }
         false
     }
