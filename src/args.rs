@@ -47,6 +47,14 @@ pub fn man(command: Option<&str>) -> String {
     String::from_utf8_lossy(&out).into_owned()
 }
 
+/// The manual pages of the program and of all its commands: name of the file, and page.
+pub fn man_pages() -> Vec<(String, String)> {
+    let commands = Args::command();
+    let names = commands.get_subcommands().map(|command| command.get_name().to_string());
+    let page = |name: String| (format!("fric-{name}.1"), man(Some(&name)));
+    std::iter::once(("fric.1".to_string(), man(None))).chain(names.map(page)).collect()
+}
+
 const EXIT_CODES: &str = "Exit codes: 0 fine, 1 the input or an expectation failed, 2 wrong usage,\n\
     3 a rig was stopped by safety or a condition of its own.\n\
     Colour and progress appear on a terminal only; NO_COLOR=1 turns colour off.";
@@ -128,6 +136,9 @@ pub enum Command {
             "bus", "doctor", "predict", "bench-rt", "new", "completions",
         ])]
         command: Option<String>,
+        /// Write the pages of fric and of all its commands into this folder: fric.1, fric-run.1, …
+        #[arg(long, value_name = "DIR", conflicts_with = "command", value_hint = ValueHint::DirPath)]
+        dir: Option<PathBuf>,
     },
 }
 

@@ -294,6 +294,26 @@ fn completions_and_the_man_page_are_printed() {
     }
     folder.check(&["man"], 0, ".TH fric 1");
     folder.check(&["man", "run"], 0, "\\-\\-solver");
+    folder.check(&["man", "--dir", "man1"], 0, "pages to man1");
+    let help = folder.check(&["--help"], 0, "").0;
+    let commands: Vec<&str> = help
+        .lines()
+        .skip_while(|line| *line != "Commands:")
+        .skip(1)
+        .take_while(|line| !line.is_empty())
+        .filter_map(|line| line.strip_prefix("  ").filter(|line| !line.starts_with(' '))?.split(' ').next())
+        .filter(|command| *command != "help")
+        .collect();
+    assert!(commands.len() > 25, "{help}");
+    for command in commands {
+        let page = fs::read_to_string(folder.0.join(format!("man1/fric-{command}.1"))).unwrap_or_default();
+        assert!(page.contains(&format!(".TH fric-{command} 1")), "{command}: {page}");
+    }
+    assert!(folder.names("man1").contains(&"fric.1".to_string()));
+    folder.check(&["man", "run", "--dir", "man1"], 2, "");
+    fs::write(folder.0.join("file"), "").unwrap();
+    let (_, err) = folder.check(&["man", "--dir", "file/man1"], 1, "");
+    assert!(err.contains("cannot write file/man1/fric.1: "), "{err}");
 }
 
 #[test]

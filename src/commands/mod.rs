@@ -133,7 +133,20 @@ pub fn run(args: &Args, begin: Instant, terminal: &mut Terminal) -> End {
             terminal.print(&args::completions(*shell));
             End::Fine
         }
-        Command::Man { command } => {
+        Command::Man { dir: Some(dir), .. } => {
+            let pages = args::man_pages();
+            let written = pages.iter().try_for_each(|(name, page)| {
+                let path = dir.join(name);
+                project::write(&path, page.as_bytes())
+                    .map_err(|error| format!("cannot write {}: {error}", path.display()))
+            });
+            match &written {
+                Ok(()) => terminal.line(&format!("wrote {} pages to {}", pages.len(), dir.display())),
+                Err(why) => terminal.error(why),
+            }
+            if written.is_ok() { End::Fine } else { End::Failed }
+        }
+        Command::Man { command, .. } => {
             terminal.print(&args::man(command.as_deref()));
             End::Fine
         }
