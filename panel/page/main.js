@@ -560,7 +560,8 @@ function draw() {
   seek();
   if (cursors) measure();
   if (last >= 0) link.send(`ack ${last}`);
-  if (newest && state?.grows && connected && !calm.matches && !document.hidden) setTimeout(wake, EACH - 12);
+  // A slow computer draws less often, and has time for its operator.
+  if (newest && state?.grows && connected && !calm.matches && !document.hidden) setTimeout(wake, Math.max(EACH - 12, 3 * (performance.now() - now)));
   // The sentences for screen readers change at most twice a second, and once at the end.
   if (now - told > 500) tell(); else { clearTimeout(telling); telling = setTimeout(tell, 500); }
 }

@@ -2,6 +2,7 @@
 
 use crate::{FRIC_RIG, debian, fine, folder, fric, said, unhurried};
 use std::fs;
+use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
 use std::time::{Duration, Instant};
@@ -313,6 +314,19 @@ fn a_rig_is_deployed_run_over_socketcand_and_replayed_to_the_bit() {
         let output = there.local(&["say", set]);
         assert!(!output.status.success() && said(&output).contains(why), "{set}: {}", said(&output));
     }
+
+    // Its panel on this computer, through ssh: the link comes once the rig has answered.
+    let mut panel = Command::new(env!("CARGO_BIN_EXE_fric"))
+        .current_dir(&folder)
+        .args(there.words("panel", &["--no-open", "--port", "0"]))
+        .stdout(Stdio::piped())
+        .spawn()
+        .unwrap();
+    let mut link = String::new();
+    let read = BufReader::new(panel.stdout.take().unwrap()).read_line(&mut link);
+    let _ = panel.kill();
+    let _ = panel.wait();
+    assert!(read.is_ok() && link.starts_with("panel  http://127.0.0.1:"), "{read:?} {link}");
 
     // Another package while drives have torque: installed, but not activated.
     let told = there.deploys(&["other.fric", "--start"]);
