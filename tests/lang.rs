@@ -189,7 +189,7 @@ macro_rules! files {
     };
 }
 
-files! { rigs steps signs variants units derivatives delay sampled regimes parts functions experiments syntax names wrong_units definitions causality values proofs identification tuning }
+files! { rigs steps signs turns variants units derivatives delay sampled regimes parts functions experiments syntax names wrong_units definitions causality values proofs identification tuning }
 
 /// Cases whose text contains several errors, each with a message of its own.
 const SEVERAL: &[&str] = &[

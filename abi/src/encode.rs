@@ -309,7 +309,7 @@ impl Encode for Dimension {
 }
 
 encode_enums! {
-    Angle { Silent = 0, Angle = 1, Rate = 2 }
+    Angle { Silent = 0, Angle = 1, Rate = 2, Cycles = 3 }
     Kind { Param = 0, Input = 1, State = 2, SampledState = 3, Output = 4, Let = 5, Regime = 6, Observed = 7 }
 }
 

@@ -218,8 +218,10 @@ pub enum Angle {
     Silent,
     /// Contains rad, deg, rev or rpm.
     Angle,
-    /// Hz, or 1/s without an angle.
+    /// 1/s without an angle.
     Rate,
+    /// Hz: periods or revolutions per second.
+    Cycles,
 }
 
 /// A unit as written. `value in SI = scale · number`.
@@ -256,7 +258,7 @@ const UNITS: &[(&str, f64, [i32; 5], bool, Angle)] = &[
     ("Pa", 1.0, [1, -1, -2, 0, 0], true, Angle::Silent),
     ("V", 1.0, [1, 2, -3, -1, 0], true, Angle::Silent),
     ("Ohm", 1.0, [1, 2, -3, -2, 0], true, Angle::Silent),
-    ("Hz", 1.0, [0, 0, -1, 0, 0], true, Angle::Rate),
+    ("Hz", 1.0, [0, 0, -1, 0, 0], true, Angle::Cycles),
     ("rad", 1.0, [0, 0, 0, 0, 0], true, Angle::Angle),
     ("deg", std::f64::consts::PI / 180.0, [0, 0, 0, 0, 0], true, Angle::Angle),
     ("rev", 2.0 * std::f64::consts::PI, [0, 0, 0, 0, 0], false, Angle::Angle),

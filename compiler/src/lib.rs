@@ -860,6 +860,7 @@ fn steps(loaded: &Loaded, name: &str, changes: &Changes, variants: &[experiment:
             return found;
         }
         let mut found = analysis::acting_mass::check(system, types, program, None, run);
+        found.extend(analysis::slow_sensor::check(system, types, run));
         if method != Method::Adaptive {
             let fixed = analysis::step_stability_report::Fixed {
                 system,
@@ -902,6 +903,7 @@ fn check_model(loaded: &Loaded, sources: &dyn Sources, model: &grammar::ast::Mod
     let (system, types, mut diagnostics) = alone(loaded, sources, (model, file), Vec::new(), depth);
     if whole && !diagnostics.iter().any(Diagnostic::is_error) {
         diagnostics.extend(analysis::lints::check(&system, &types, &loaded.files, physics));
+        diagnostics.extend(analysis::slow_sensor::check(&system, &types, model.name.span));
         if let Some((opened, contacts)) = analysis::pushes::open(&system, &types).filter(|_| physics) {
             let mut found = Vec::new();
             let types = analyse(&opened, &loaded.files, Depth::Causality, &Diagnostic::is_error, &mut found);

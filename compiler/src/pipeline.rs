@@ -4,6 +4,7 @@
 //! where an earlier one has reported an error, since it would report consequences of that error.
 
 use crate::analysis::{domains, parameter_checks};
+use crate::frontend::angles;
 use crate::frontend::causality;
 use crate::frontend::source::Files;
 use crate::frontend::system::System;
@@ -37,6 +38,9 @@ pub fn analyse(
     diagnostics: &mut Vec<Diagnostic>,
 ) -> Types {
     let types = units::check(system, files, diagnostics);
+    if !diagnostics.iter().any(Diagnostic::is_error) {
+        angles::check(system, &types, files, diagnostics);
+    }
     if depth == Depth::Units {
         return types;
     }

@@ -16,3 +16,4 @@ pub mod explain;
 pub mod step_stability_report;
 pub mod linearise;
 pub mod pushes;
+pub mod slow_sensor;

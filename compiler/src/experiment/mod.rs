@@ -25,6 +25,7 @@ use sweeps::{combinations, grids, label, meets, same_path, unmatched_cases};
 use crate::analysis::linearise::{OpenPorts, PortSlots, Ports, open};
 use crate::analysis::parameter_checks;
 use crate::analysis::tuning::{self, Tuned};
+use crate::frontend::angles;
 use crate::frontend::delays;
 use crate::frontend::flatten::{Instance, Override, OverrideValue, Request, flatten};
 use crate::frontend::resolve::Loaded;
@@ -830,7 +831,7 @@ impl Reader<'_> {
             Node::Table(table, _) => {
                 let table = &self.system.tables[*table as usize];
                 let recorded = self.recorded.iter().find(|(name, _)| *name == table.name);
-                recorded.map_or_else(|| Unit::si(table.y_dimension), |(_, unit)| unit.clone())
+                recorded.map_or_else(|| Unit::si(table.y_unit.dimension), |(_, unit)| unit.clone())
             }
             Node::Binary(BinaryOp::Add | BinaryOp::Subtract, a, b) => {
                 let (a, b) = (self.own_unit(*a), self.own_unit(*b));
@@ -846,7 +847,11 @@ impl Reader<'_> {
         match Unit::parse(&text.text) {
             // A condition is true or false, whatever unit stands beside it.
             Ok(_) if self.types.boolean[expr.0 as usize] => Some(Unit::none()),
-            Ok(unit) if unit.dimension == self.dimension(expr) => Some(unit),
+            Ok(unit) if unit.dimension == self.dimension(expr) => {
+                let files = &self.loaded.files;
+                self.diagnostics.extend(angles::shown_in(self.system, self.types, files, (expr, &unit), text.span));
+                Some(unit)
+            }
             Ok(unit) => {
                 let message = format!("this is {}, it cannot be shown in {unit}", self.dimension(expr).describe());
                 let error = Diagnostic::error("E0101", message)

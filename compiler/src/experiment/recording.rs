@@ -65,8 +65,8 @@ pub(super) fn recording(
         let name = column.name.text.clone();
         let table = Table {
             name: format!("data.{name}"),
-            x_dimension: seconds,
-            y_dimension: unit.dimension,
+            x_unit: Unit::si(seconds),
+            y_unit: unit.clone(),
             smooth: false,
             x: t.clone(),
             y,

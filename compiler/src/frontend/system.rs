@@ -249,12 +249,12 @@ pub enum Node {
     InRegime(AutomatonId, u32),
     /// A crossing, by its index.
     Crossing(u32),
-    /// A value that must have this dimension: an argument or result of a function.
+    /// A value that must have the dimension of this unit: an argument or result of a function.
     Fits {
         /// The value, which the node returns unchanged.
         value: ExprId,
-        /// Required dimension.
-        dimension: Dimension,
+        /// The unit that is stated, whose dimension is required.
+        unit: Box<Unit>,
         /// Reason for the requirement.
         role: Role,
     },
@@ -439,9 +439,9 @@ pub struct Table {
     /// Name as written.
     pub name: String,
     /// Dimension of the argument.
-    pub x_dimension: Dimension,
+    pub x_unit: Unit,
     /// Dimension of the value.
-    pub y_dimension: Dimension,
+    pub y_unit: Unit,
     /// Whether it interpolates by monotone cubics rather than linearly.
     pub smooth: bool,
     /// Arguments, in SI units.
@@ -475,6 +475,7 @@ pub const LINTS: &[(&str, &str)] = &[
     ("large-step", "W0704"),
     ("chatter", "W0705"),
     ("pushes", "W0706"),
+    ("slow-sensor", "W0707"),
     ("emulation-limit", "W0801"),
     ("coarse-encoder", "W0802"),
     ("coarse-speed", "W0803"),

@@ -6,7 +6,8 @@ use crate::frontend::columns::{self, Selector};
 use crate::frontend::resolve::Loaded;
 use crate::frontend::source::Sources;
 use crate::frontend::system::Table;
-use abi::unit::{Dimension, Unit};
+use crate::frontend::turns;
+use abi::unit::Unit;
 use grammar::ast::{self, Expr, ExprKind, TablePoints, TableShape, UnaryOp};
 use grammar::diagnostic::Diagnostic;
 use grammar::span::{FileId, Span};
@@ -36,8 +37,8 @@ pub fn read(
     match &table.points {
         TablePoints::Listed(points) => {
             for (a, b) in points {
-                x.push(number(a, x_unit.dimension, diagnostics)?);
-                y.push(number(b, y_unit.dimension, diagnostics)?);
+                x.push(number(a, (&x_unit, &table.arg.unit), diagnostics)?);
+                y.push(number(b, (&y_unit, &table.unit), diagnostics)?);
                 check_order(&x, a.span, diagnostics)?;
             }
         }
@@ -56,14 +57,7 @@ pub fn read(
         diagnostics.push(error.label(table.name.span, "at least one is needed"));
         return None;
     }
-    Some(Table {
-        name: table.name.text.clone(),
-        x_dimension: x_unit.dimension,
-        y_dimension: y_unit.dimension,
-        smooth: table.shape == TableShape::Smooth,
-        x,
-        y,
-    })
+    Some(Table { name: table.name.text.clone(), x_unit, y_unit, smooth: table.shape == TableShape::Smooth, x, y })
 }
 
 /// Columns of a file of numbers, converted to SI, each with the unit it is shown in. The unit in the heading is that of
@@ -103,7 +97,8 @@ pub fn columns(
     let mut out = Vec::new();
     for (k, ((numbers, stated), (_, unit))) in read.numbers.iter().zip(&read.units).zip(wanted).enumerate() {
         let unit = unit.as_ref().or(stated.as_ref()).cloned().unwrap_or_default();
-        if let Some(stated) = stated.as_ref().filter(|stated| stated.dimension != unit.dimension) {
+        let differs = |stated: &&Unit| stated.dimension != unit.dimension || turns::apart(stated, &unit);
+        if let Some(stated) = stated.as_ref().filter(differs) {
             let shown = |unit: &Unit| match unit.dimension.is_none() {
                 true => "a pure number".to_string(),
                 false => format!("in {unit}"),
@@ -132,11 +127,17 @@ fn check_order(x: &[f64], span: Span, diagnostics: &mut Vec<Diagnostic>) -> Opti
     }
 }
 
-/// A literal of this dimension, in SI.
-fn number(expr: &Expr, dimension: Dimension, diagnostics: &mut Vec<Diagnostic>) -> Option<f64> {
+/// A literal in SI, and of the dimension of a unit.
+fn number(
+    expr: &Expr,
+    (wanted, declared): (&Unit, &Option<ast::UnitText>),
+    diagnostics: &mut Vec<Diagnostic>,
+) -> Option<f64> {
+    let dimension = wanted.dimension;
     match &expr.kind {
-        ExprKind::Unary(UnaryOp::Negate, a) => Some(-number(a, dimension, diagnostics)?),
+        ExprKind::Unary(UnaryOp::Negate, a) => Some(-number(a, (wanted, declared), diagnostics)?),
         ExprKind::Number { value, unit } => {
+            let bare = unit.is_none();
             let unit = match unit {
                 None => Unit::none(),
                 Some(text) => match Unit::parse(&text.text) {
@@ -161,6 +162,16 @@ fn number(expr: &Expr, dimension: Dimension, diagnostics: &mut Vec<Diagnostic>) 
                 };
                 diagnostics.push(error);
                 return None;
+            }
+            if let Some(declared) = declared.as_ref().filter(|_| bare && *value != 0.0 && turns::scaled(wanted)) {
+                let text = value.to_string();
+                diagnostics.push(turns::bare_angle((&text, *value, expr.span), wanted, declared.span));
+            } else if let Some(declared) = declared.as_ref().filter(|_| turns::apart(&unit, wanted)) {
+                let message = format!("{unit} and {wanted} are a factor 2π apart");
+                let warning =
+                    Diagnostic::warning("W0107", message).label(expr.span, "both are 1/s: no factor is applied");
+                diagnostics
+                    .push(warning.label(declared.span, "declared here").help("write all numbers in the same unit"));
             }
             Some(unit.to_si(*value))
         }

@@ -6,9 +6,8 @@
 
 use crate::frontend::source::Files;
 use crate::frontend::system::*;
-use crate::functions::Units;
-use abi::format::three_digits;
-use abi::unit::{Angle, Dimension, Ratio, Unit};
+use crate::functions::{Unary, Units};
+use abi::unit::{Dimension, Ratio, Unit};
 use grammar::ast::BinaryOp;
 use grammar::diagnostic::Diagnostic;
 use grammar::span::Span;
@@ -311,7 +310,7 @@ impl Checker<'_> {
             Node::Call(builtin, args) => self.call(builtin, &args),
             Node::Table(table, x) => {
                 let table = &self.system.tables[table as usize];
-                let (wanted, result) = (Term::known(table.x_dimension), Term::known(table.y_dimension));
+                let (wanted, result) = (Term::known(table.x_unit.dimension), Term::known(table.y_unit.dimension));
                 if let Some(term) = self.real(x)
                     && !self.unify(&term, &wanted)
                 {
@@ -328,7 +327,7 @@ impl Checker<'_> {
             }
             // The difference is an earlier node and has been checked as a subtraction.
             Node::Crossing(_) => NodeType::Boolean,
-            Node::Fits { value, dimension, role } => self.fits(value, dimension, &role),
+            Node::Fits { value, unit, role } => self.fits(value, unit.dimension, &role),
             Node::Measure(measure, value, second, window) => {
                 for edge in [window.after, window.before].into_iter().flatten() {
                     if let Some(given) = self.real(edge)
@@ -490,9 +489,30 @@ impl Checker<'_> {
             let (name, unit) = (&factor.name, Unit::si(missing));
             return Some(format!("a factor in {unit} is missing; `{name}` is one: `{name} * {text}`"));
         }
-        let divisor = param(found.base.over(wanted.base))?;
+        let Some(divisor) = param(found.base.over(wanted.base)) else {
+            return self.other_unit(value, missing);
+        };
         let (name, unit) = (&divisor.name, Unit::si(found.base.over(wanted.base)));
         Some(format!("divide by something in {unit}; `{name}` is one: `{text} / {name}`"))
+    }
+
+    /// The unit of the only parameter of a product with which the product would fit.
+    fn other_unit(&self, value: ExprId, missing: Dimension) -> Option<String> {
+        let (mut stack, mut params) = (vec![(value, true)], Vec::new());
+        while let Some((id, above)) = stack.pop() {
+            match self.system.node(id) {
+                Node::Binary(BinaryOp::Multiply, a, b) => stack.extend([(*b, above), (*a, above)]),
+                Node::Binary(BinaryOp::Divide, a, b) => stack.extend([(*b, !above), (*a, above)]),
+                Node::Negate(a) => stack.push((*a, above)),
+                Node::Var(id) if self.system.var(*id).kind == VarKind::Param => params.push((*id, above)),
+                _ => {}
+            }
+        }
+        let [(id, above)] = params[..] else { return None };
+        let var = self.system.var(id);
+        let now = self.unit_of(var)?;
+        let fitting = Unit::si(if above { now.times(missing) } else { now.over(missing) });
+        Some(format!("with `{}` in {fitting} it would fit; it is in {} now", var.name, Unit::si(now)))
     }
 
     /// The instance that owns the first quantity of the expression.
@@ -569,7 +589,6 @@ impl Checker<'_> {
             BinaryOp::Power => self.power(a, &x, b, &y),
             BinaryOp::Add | BinaryOp::Subtract => {
                 if self.unify(&x, &y) {
-                    self.angles(a, b);
                     return NodeType::Real(if x.unknowns.is_empty() { x } else { y });
                 }
                 let message = if op == BinaryOp::Add {
@@ -584,8 +603,6 @@ impl Checker<'_> {
                 if !self.unify(&x, &y) {
                     let message = format!("cannot compare {} with {}", self.described(&x), self.described(&y));
                     self.differ("E0101", message, a, &x, b, &y);
-                } else {
-                    self.angles(a, b);
                 }
                 NodeType::Boolean
             }
@@ -694,6 +711,11 @@ impl Checker<'_> {
                 format!("whole numbers of {unit}, or of what?"),
                 format!("say of what: `(1 {unit}) * floor({text} / (1 {unit}))`"),
             ),
+            Builtin::Unary(Unary::Sin | Unary::Cos | Unary::Tan) if self.resolved(term).base == TIME => (
+                unit.clone(),
+                "an angle is a rate times the time: `2 * pi * 1 Hz * t`, or `1 rad/s * t`; a signal `sine(1 N, 1 Hz)`"
+                    .into(),
+            ),
             _ => (unit.clone(), format!("divide by a quantity of the same kind: `{text} / 1 {unit}`")),
         };
         self.diagnostics.push(Diagnostic::error("E0104", message).label(self.system.span(arg), label).help(help));
@@ -728,47 +750,6 @@ impl Checker<'_> {
             }
         }
         NodeType::Real(wanted)
-    }
-
-    // ---- lint `angle`
-
-    fn angle(&self, id: ExprId) -> Angle {
-        match self.system.node(id) {
-            Node::Number { angle, .. } => *angle,
-            Node::Var(var) => self.system.var(*var).unit.as_ref().map_or(Angle::Silent, |(unit, _)| unit.angle),
-            Node::Negate(a) => self.angle(*a),
-            _ => Angle::Silent,
-        }
-    }
-
-    fn angles(&mut self, a: ExprId, b: ExprId) {
-        let (x, y) = (self.angle(a), self.angle(b));
-        if (x, y) == (Angle::Rate, Angle::Angle) || (x, y) == (Angle::Angle, Angle::Rate) {
-            let (rate, angle) = if x == Angle::Rate { (a, b) } else { (b, a) };
-            self.angle_met(rate, self.system.span(angle));
-        }
-    }
-
-    fn angle_met(&mut self, rate: ExprId, angle: Span) {
-        let text = self.text(rate).to_string();
-        let number = text.split(|c: char| c.is_ascii_alphabetic() || c == ' ').next().unwrap_or_default().to_string();
-        let warning = match self.system.node(rate) {
-            Node::Number { value, .. } if text.ends_with("Hz") => {
-                let exact = three_digits(value * 2.0 * std::f64::consts::PI);
-                Diagnostic::warning(
-                    "W0107",
-                    format!("{text} is {number} rad/s here, not {number} revolutions per second"),
-                )
-                .label(angle, "an angular velocity")
-                .label(self.system.span(rate), "a rate, without an angle")
-                .help(format!("write `{number} rev/s` ({exact} rad/s), or `{number} rad/s` if that is what you mean"))
-            }
-            _ => Diagnostic::warning("W0107", "a rate meets an angular velocity")
-                .label(angle, "an angular velocity")
-                .label(self.system.span(rate), "a rate, without an angle")
-                .help("if it counts revolutions, multiply by `2 * pi`, or write its unit as rev/s"),
-        };
-        self.diagnostics.push(warning);
     }
 
     // ---- definitions
@@ -816,10 +797,6 @@ impl Checker<'_> {
             }
         };
         if self.unify(&found, &wanted) {
-            let declared = var.unit.as_ref().map(|(unit, span)| (unit.angle, *span));
-            if let (Some((Angle::Angle, span)), Angle::Rate) = (declared, self.angle(value)) {
-                self.angle_met(value, span);
-            }
             return;
         }
         let unit = var.unit.as_ref();

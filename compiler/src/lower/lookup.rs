@@ -135,7 +135,7 @@ mod tests {
     use super::*;
     use crate::ir::interpret;
     use abi::Slot;
-    use abi::unit::Dimension;
+    use abi::unit::{Dimension, Unit};
 
     /// A table of n points (k², (k − 2)³), read at x.
     fn read(n: usize, smooth: bool, x: f64) -> f64 {
@@ -143,8 +143,8 @@ mod tests {
         let dimension = Dimension::NONE;
         let table = Table {
             name: "table".into(),
-            x_dimension: dimension,
-            y_dimension: dimension,
+            x_unit: Unit::si(dimension),
+            y_unit: Unit::si(dimension),
             smooth,
             x: points().map(|k| k * k).collect(),
             y: points().map(|k| (k - 2.0) * (k - 2.0) * (k - 2.0)).collect(),

@@ -434,8 +434,7 @@ impl<'a> Flattener<'a> {
                     && let Some(unit) = self.unit(unit, env.rotary, env.instance)
                 {
                     let role = Role::Result { function: name.text.clone() };
-                    value =
-                        self.system.push(Node::Fits { value, dimension: unit.dimension, role }, constant.value.span);
+                    value = self.system.push(Node::Fits { value, unit: Box::new(unit), role }, constant.value.span);
                 }
                 self.open_consts.pop();
                 self.consts.insert((item, env.rotary), value);
@@ -726,12 +725,12 @@ impl<'a> Flattener<'a> {
         }
         let mut locals = Vec::new();
         for ((arg, expr), value) in function.args.iter().zip(args).zip(values) {
-            let dimension = match &arg.unit {
-                None => Some(Dimension::NONE),
-                Some(unit) => self.unit(unit, env.rotary, env.instance).map(|unit| unit.dimension),
+            let unit = match &arg.unit {
+                None => Some(Unit::none()),
+                Some(unit) => self.unit(unit, env.rotary, env.instance),
             };
             let role = Role::Argument { function: function.name.text.clone(), name: arg.name.text.clone() };
-            locals.push((arg.name.text.clone(), self.fitting(value, dimension, role, expr.span)));
+            locals.push((arg.name.text.clone(), self.fitting(value, unit, role, expr.span)));
         }
         if function.args.len() != args.len() {
             self.wrong_count(name, function.args.len(), args.len());
@@ -760,15 +759,15 @@ impl<'a> Flattener<'a> {
         self.functions.pop();
         let unit = function.unit.as_ref().and_then(|unit| self.unit(unit, env.rotary, env.instance));
         let role = Role::Result { function: function.name.text.clone() };
-        let result = self.fitting(body, unit.map(|unit| unit.dimension), role, span);
+        let result = self.fitting(body, unit, role, span);
         self.expansions.insert(key, result);
         result
     }
 
     /// The value with a check of its dimension, if there is one.
-    fn fitting(&mut self, value: ExprId, dimension: Option<Dimension>, role: Role, span: Span) -> ExprId {
-        match dimension {
-            Some(dimension) => self.system.push(Node::Fits { value, dimension, role }, span),
+    fn fitting(&mut self, value: ExprId, unit: Option<Unit>, role: Role, span: Span) -> ExprId {
+        match unit {
+            Some(unit) => self.system.push(Node::Fits { value, unit: Box::new(unit), role }, span),
             None => value,
         }
     }
@@ -794,8 +793,8 @@ impl<'a> Flattener<'a> {
             let number = made.map(|mut table| {
                 if env.rotary {
                     // The rotary twin has the same numbers with mapped dimensions.
-                    table.x_dimension = table.x_dimension.rotary();
-                    table.y_dimension = table.y_dimension.rotary();
+                    table.x_unit = table.x_unit.rotary();
+                    table.y_unit = table.y_unit.rotary();
                 }
                 self.system.tables.push(table);
                 self.system.tables.len() as u32 - 1

@@ -213,7 +213,7 @@ pub fn flatten_item(loaded: &Loaded, sources: &dyn Sources, file: FileId, item: 
             match function.unit.as_ref().and_then(|unit| f.unit(unit, false, None)) {
                 Some(unit) => {
                     let role = Role::Result { function: function.name.text.clone() };
-                    vec![f.system.push(Node::Fits { value, dimension: unit.dimension, role }, function.body.span)]
+                    vec![f.system.push(Node::Fits { value, unit: Box::new(unit), role }, function.body.span)]
                 }
                 None => vec![value],
             }

@@ -111,9 +111,9 @@ impl<'a> Flattener<'a> {
         if let Some(known) = self.system.tables.iter().position(|table| table.name == name) {
             return known as u32;
         }
-        let y_dimension = of.y_dimension.over(of.x_dimension);
+        let y_unit = Unit::si(of.y_unit.dimension.over(of.x_unit.dimension));
         let y = differences(&of.x, &of.y);
-        let table = Table { name, x_dimension: of.x_dimension, y_dimension, smooth: false, x: of.x.clone(), y };
+        let table = Table { name, x_unit: of.x_unit.clone(), y_unit, smooth: false, x: of.x.clone(), y };
         self.system.tables.push(table);
         self.system.tables.len() as u32 - 1
     }
