@@ -195,7 +195,7 @@ mod tests {
         let width = series.len();
         let booleans: Vec<bool> = series.iter().map(|series| series.boolean).collect();
         let plot = Plot { series, against: None, view: View::default() };
-        let mut recorder = Recorder::whole(&[plot], 1_000_000);
+        let mut recorder = Recorder::whole(&[plot], &[], 1_000_000);
         for k in 0..random.below(40) + 1 {
             let mut value = |boolean| match boolean {
                 true => f64::from(u8::from(random.below(2) == 0)),

@@ -22,6 +22,10 @@ pub struct Experiment {
     pub bench: Option<Box<Bench>>,
     /// The plots to draw and write.
     pub plots: Vec<Plot>,
+    /// Further quantities of the data, which no plot draws.
+    pub records: Vec<Series>,
+    /// The distance of the rows of the data in s; `None`: each step is a row.
+    pub every: Option<f64>,
     /// The conditions that must hold.
     pub expects: Vec<Expect>,
     /// Instants in s, ascending, at which a signal or a recording has a corner.
@@ -31,10 +35,20 @@ pub struct Experiment {
 }
 
 impl Experiment {
-    /// The slots that its measures and plots read during a run.
+    /// The quantities of its data: what is recorded, and what the plots draw.
+    pub fn recorded(&self) -> impl Iterator<Item = &Series> {
+        let drawn = self.plots.iter().flat_map(|plot| plot.series.iter().chain(&plot.against));
+        self.records.iter().chain(drawn)
+    }
+
+    /// The experiment without plots and data.
+    pub fn unrecorded(&self) -> Experiment {
+        Experiment { plots: Vec::new(), records: Vec::new(), every: None, ..self.clone() }
+    }
+
+    /// The slots that its measures, plots and data read during a run.
     pub fn reads(&self) -> BTreeSet<Slot> {
-        let series =
-            self.plots.iter().flat_map(|plot| plot.series.iter().chain(&plot.against)).map(|series| series.slot);
+        let series = self.recorded().map(|series| series.slot);
         let measures = self.expects.iter().flat_map(|expect| &expect.measures);
         series.chain(measures.flat_map(Measure::reads)).collect()
     }

@@ -457,6 +457,7 @@ pub enum ExperimentStatement {
     /// `tune fr.Fs in 1 N .. 2 N, fr.vs`
     Tune(Vec<Tuned>, Span),
     Expect(Expect),
+    Record(Record),
     Allow(Allow),
 }
 
@@ -495,6 +496,16 @@ pub struct Solver {
     pub method: Name,
     pub step: Option<Expr>,
     pub tol: Option<Expr>,
+    pub span: Span,
+}
+
+/// `record F [N], body.v every 1 ms`: quantities of the data that a run writes.
+#[derive(Clone, PartialEq, Debug)]
+#[allow(missing_docs)]
+pub struct Record {
+    pub shows: Vec<Show>,
+    /// The distance of its rows in time; without it each step is a row.
+    pub every: Option<Expr>,
     pub span: Span,
 }
 

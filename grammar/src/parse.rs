@@ -812,6 +812,11 @@ impl<'t> Reader<'t> {
                     let (value, shows, cases) = (show.value, Some(show.unit), self.cases(&mut children));
                     ExperimentStatement::Expect(Expect { value, near: None, shows, after, before, cases, span })
                 }
+                Rule::recorded => {
+                    let shows = self.shows(&mut children);
+                    let every = says(&pair, Rule::kw_every).then(|| self.value(&mut children));
+                    ExperimentStatement::Record(Record { shows, every, span })
+                }
                 Rule::allow => ExperimentStatement::Allow(self.allow(pair)),
                 Rule::vary => {
                     let items = children.all(Rule::vary_item).into_iter().map(|item| {

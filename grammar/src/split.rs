@@ -86,8 +86,10 @@ impl Place {
     /// Words that begin a statement in this block and are allowed as names elsewhere.
     fn starters(self) -> &'static [&'static str] {
         match self {
-            Place::Experiment => &["run", "solver", "sweep", "data", "plot", "tune", "expect", "show"],
-            Place::Fit => &["run", "solver", "sweep", "data", "plot", "tune", "expect", "show", "vary", "minimise"],
+            Place::Experiment => &["run", "solver", "sweep", "data", "plot", "tune", "expect", "show", "record"],
+            Place::Fit => {
+                &["run", "solver", "sweep", "data", "plot", "tune", "expect", "show", "record", "vary", "minimise"]
+            }
             Place::Device => &["send", "read"],
             Place::Rig => &[
                 "run", "rate", "solver", "bus", "drive", "hardware", "watchdog", "overrun", "predict", "safe", "stop",
@@ -404,6 +406,7 @@ impl<'t> Source<'t> {
             let condition = word == "when"
                 && matches!(self.word(first), "go" | "stop")
                 && !(first..at).any(|mark| self.is_word(mark, "when"));
+            let condition = condition || word == "every" && self.word(first) == "record";
             let argument = inside && self.is_symbol(at + 1, "=");
             let call = !matches!(word, "next" | "reset") || self.is_symbol(at + 1, "(");
             return !condition && !argument && call && (fresh || !head) && begins(true);

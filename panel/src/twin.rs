@@ -40,6 +40,8 @@ impl Twin {
             solver: Solver { method: Method::Expo, step: period / STEPS, tol: 1e-6, parts: PARTS },
             bench: Some(Box::new(Bench { rig, plant })),
             plots: vec![Plot { series: series.clone(), against: None, view: View::default() }],
+            records: Vec::new(),
+            every: None,
             expects: Vec::new(),
             corners: Vec::new(),
             stepped: true,

@@ -143,32 +143,39 @@ fn experiment(
         }
     }
 
+    let recorded = |case: &Case| case.experiment.recorded().next().is_some();
     if cases.iter().all(|case| case.experiment.plots.is_empty()) {
+        let records = cases.iter().any(recorded);
         let asked = [
             (args.plot.is_some() && together.is_none(), "--plot"),
-            (args.data.is_some(), "--data"),
-            (args.every.is_some(), "--every"),
+            (args.data.is_some() && !records, "--data"),
+            (args.every.is_some() && !records, "--every"),
         ];
         if let Some((_, option)) = asked.into_iter().find(|(asked, _)| *asked) {
             terminal.error(&format!(
-                "{}: {option} has nothing to write: `{name}` records nothing; add `plot` with what to record, such as `plot x, v`",
-                place(loaded, name)
+                "{}: {option} has nothing to write: `{name}` {}",
+                place(loaded, name),
+                match option {
+                    "--plot" => "draws nothing; add `plot` with what to draw, such as `plot x, v`",
+                    _ => "records nothing; add `record` with what to record, such as `record x, v`",
+                }
             ));
             return End::Failed;
         }
-        if talking && args.out.is_some() {
-            terminal.line("  nothing to write: the experiment has no `plot`");
+        if talking && args.out.is_some() && !records {
+            terminal.line("  nothing to write: the experiment has no `plot` and no `record`");
         }
     }
-    let grids: Result<Vec<_>, _> = args
-        .every
+    let every = |case: &Case| args.every.or(case.experiment.every.filter(|_| !args.thin));
+    let grids: Result<Vec<Option<Vec<f64>>>, _> = cases
         .iter()
-        .flat_map(|every| cases.iter().map(|case| even_grid::instants(*every, &case.experiment)))
+        .map(|case| every(case).map(|every| even_grid::instants(every, &case.experiment)).transpose())
         .collect();
     let grids = match grids {
         Ok(grids) => grids,
         Err(why) => {
-            terminal.error(&format!("{}: --every: {why}", place(loaded, name)));
+            let option = if args.every.is_some() { "--every" } else { "`every`" };
+            terminal.error(&format!("{}: {option}: {why}", place(loaded, name)));
             return End::Failed;
         }
     };
@@ -310,22 +317,22 @@ fn show(picture: Option<&Path>, terminal: &mut Terminal) {
 /// Most rows of the data that the default folder gets without being asked.
 const UNASKED_ROWS: u64 = 100_000;
 
-/// Writes the requested files, or returns the one that failed and why. `grids`: the instants of each case in s, if rows
-/// are requested on a time grid.
+/// Writes the requested files, or returns the one that failed and why. `grids`: the instants of each case in s, where
+/// rows are requested on a time grid.
 fn write(
     args: &Run,
     name: &str,
     cases: &[Case],
     recorded: &[Recorded],
-    grids: &[Vec<f64>],
+    grids: &[Option<Vec<f64>>],
     drawn: Option<&Figure>,
     picture: Option<&PathBuf>,
 ) -> Result<Written, (PathBuf, String)> {
     let by_default = args.plot.is_none() && args.data.is_none() && !args.json;
     let folder = args.out.clone().or(by_default.then(|| PathBuf::from("out")));
     let mut written = Written::default();
-    let Some(figure) = drawn else { return Ok(written) };
-    for path in folder.iter().map(|folder| folder.join(format!("{name}.svg"))).chain(picture.cloned()) {
+    let pictures = folder.iter().map(|folder| folder.join(format!("{name}.svg"))).chain(picture.cloned());
+    for (path, figure) in pictures.zip(std::iter::repeat(drawn)).filter_map(|(path, drawn)| Some((path, drawn?))) {
         let bytes = plot::picture(figure, &args.look.look(), Kind::of(&path).unwrap_or(Kind::Svg));
         written.put(&path, &bytes, "")?;
         written.picture = Some(path).filter(|path| !project::is_standard(path)).or(written.picture);
@@ -338,7 +345,7 @@ fn write(
         if tables.is_empty() || recording.columns().is_empty() {
             continue;
         }
-        let rows = rows(args, case, recording, grids.get(k), asked);
+        let rows = rows(args, case, recording, grids.get(k).and_then(Option::as_ref), asked);
         let (rows, remark) = rows.map_err(|why| (tables[0].clone(), why))?;
         for path in &tables {
             let path = for_case(path, label);

@@ -380,6 +380,7 @@ impl Found {
                         | ExperimentStatement::Plot(_)
                         | ExperimentStatement::Tune(..)
                         | ExperimentStatement::Expect(_)
+                        | ExperimentStatement::Record(_)
                         | ExperimentStatement::Allow(_) => {}
                     }
                 }

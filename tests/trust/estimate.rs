@@ -95,7 +95,7 @@ fn compiled(loaded: &mut Loaded, name: &str, changes: Changes) -> Option<Vec<Cas
 }
 
 fn go(case: &Case, solver: Solver) -> Option<Outcome> {
-    let experiment = Experiment { solver, plots: Vec::new(), ..case.experiment.clone() };
+    let experiment = Experiment { solver, ..case.experiment.unrecorded() };
     engine::run(case.instance.clone(), &experiment, &mut |_| Continue::Continue(())).ok()
 }
 
@@ -149,7 +149,7 @@ impl Survey<'_> {
 
     fn judge(&mut self, subject: &Subject, case: &Case, solver: Solver, truth: &[(f64, f64)], label: &str) {
         let Some(mut outcome) = go(case, solver) else { return };
-        let experiment = Experiment { solver, plots: Vec::new(), ..case.experiment.clone() };
+        let experiment = Experiment { solver, ..case.experiment.unrecorded() };
         let before = outcome.clone();
         estimate::errors(&case.instance, &experiment, &mut outcome, &mut |_| Continue::Continue(()));
         let found = readings(&outcome);

@@ -35,6 +35,8 @@ use crate::frontend::units::Types;
 use crate::lower::{Lowered, MOST_DENSE, Observed, evaluate, lower};
 use crate::pipeline::{Depth, analyse};
 use crate::rig::{self, LoadedRig};
+use abi::format::duration as shown;
+use abi::live;
 use abi::plan::{self, MeasureKind, Method, PARTS, Solver};
 use abi::unit::{Dimension, Unit};
 use grammar::ast::{self, BinaryOp, ExperimentStatement, Expr};
@@ -138,6 +140,8 @@ pub const DEFAULT_TOL: f64 = 1e-6;
 pub const DEFAULT_STEP: f64 = 1e-5;
 /// Limit on the number of fixed steps in a run.
 const MOST_STEPS: f64 = 1e12;
+/// Most rows of data that an experiment may ask for.
+const MOST_ROWS: f64 = 1e7;
 /// Limit on the number of combinations of an experiment's sweeps.
 pub const MOST_VARIANTS: usize = 100_000;
 
@@ -152,6 +156,7 @@ struct Statements<'a> {
     plots: Vec<&'a ast::Plot>,
     tunes: Vec<&'a ast::Tuned>,
     expects: Vec<&'a ast::Expect>,
+    records: Vec<&'a ast::Record>,
     /// `allow discretisation`
     stepped: bool,
     /// Names of all lints that it allows.
@@ -335,6 +340,7 @@ fn parts<'a>(
     let mut parts = (None, Vec::new(), None, Vec::new(), Vec::new());
     let (mut stepped, mut allowed, mut tunes) = (false, Vec::new(), Vec::new());
     let mut unknown = Vec::new();
+    let mut records: Vec<&ast::Record> = Vec::new();
     let mut twice = |what: &str, span: Span, first: Span| {
         let error = Diagnostic::error("E0301", format!("an experiment has one `{what}`"))
             .label(span, "again here")
@@ -359,6 +365,7 @@ fn parts<'a>(
             ExperimentStatement::Plot(one) => parts.3.push(one),
             ExperimentStatement::Tune(all, _) => tunes.extend(all),
             ExperimentStatement::Expect(one) => parts.4.push(one),
+            ExperimentStatement::Record(one) => records.push(one),
             ExperimentStatement::Allow(allow) => {
                 let own = matches!(allow.lint.text.as_str(), "discretisation" | "recording-ends");
                 stepped |= allow.lint.text == "discretisation";
@@ -378,7 +385,19 @@ fn parts<'a>(
         return None;
     };
     let (solver, sweeps, data, plots, expects) = parts;
-    Some(Statements { span: experiment.span, run, solver, sweeps, data, plots, tunes, expects, stepped, allowed })
+    Some(Statements {
+        span: experiment.span,
+        run,
+        solver,
+        sweeps,
+        data,
+        plots,
+        tunes,
+        expects,
+        records,
+        stepped,
+        allowed,
+    })
 }
 
 #[allow(clippy::too_many_arguments)]
@@ -429,6 +448,9 @@ fn variant<'a>(
             before: expect.before.as_ref().map(&mut add),
         })
         .collect();
+    let records: Vec<usize> =
+        parts.records.iter().flat_map(|record| &record.shows).map(|show| add(&show.value)).collect();
+    let every: Option<usize> = parts.records.iter().find_map(|record| record.every.as_ref()).map(&mut add);
     on_stage("flatten");
     let mut diagnostics = Vec::new();
     let (system, types, nodes, ports, cut) = match prepared {
@@ -536,6 +558,9 @@ fn variant<'a>(
         let at = reader.plot(plot, (curves, against.as_ref()), window, &nodes, duration, &mut expects_at);
         plots_at.extend(at);
     }
+    let shows = parts.records.iter().flat_map(|record| &record.shows);
+    let records_at: Vec<usize> = shows.zip(&records).map(|(show, at)| reader.record(show, nodes[*at])).collect();
+    let every = every.and_then(|at| reader.every(parts, nodes[at], duration, &solver, cut.is_some()));
     let ports_at: Vec<usize> = ports.outputs.iter().map(|(_, node)| reader.want(*node, None)).collect();
     let (wanted, diagnostics) = (std::mem::take(&mut reader.wanted), std::mem::take(&mut reader.diagnostics));
     let places = std::mem::take(&mut reader.places);
@@ -592,6 +617,7 @@ fn variant<'a>(
         view: plot.view,
     });
     let plots = plots.collect();
+    let records = records_at.into_iter().map(series).collect();
     let expects = expects_at
         .into_iter()
         .flatten()
@@ -621,8 +647,18 @@ fn variant<'a>(
     corners.sort_by(f64::total_cmp);
     corners.dedup();
     let stepped = parts.stepped;
-    let experiment =
-        plan::Experiment { name: name.to_string(), duration, solver, bench: None, plots, expects, corners, stepped };
+    let experiment = plan::Experiment {
+        name: name.to_string(),
+        duration,
+        solver,
+        bench: None,
+        plots,
+        records,
+        every,
+        expects,
+        corners,
+        stepped,
+    };
     let inputs = ports.inputs.iter().filter_map(|(path, moved)| {
         let quantity = program.description.quantity(moved)?;
         Some((path.clone(), quantity.slot))
@@ -819,6 +855,61 @@ impl Reader<'_> {
         let unit = unit.or_else(|| Some(self.own_unit(expr)));
         self.wanted.push(Observed { expr, text, unit });
         self.wanted.len() - 1
+    }
+
+    /// A quantity of the data.
+    fn record(&mut self, show: &ast::Show, node: ExprId) -> usize {
+        if self.measured(node) {
+            let error = Diagnostic::error("E0901", "a measure has one value for the whole run, and the data have rows")
+                .label(show.span, "record the quantity itself");
+            self.diagnostics.push(error.help("write `show` in place of `record` to see it after the run"));
+        }
+        let unit = show.unit.as_ref().and_then(|text| self.unit_for(node, text));
+        self.want(node, unit)
+    }
+
+    /// The distance of the rows of the data.
+    fn every(&mut self, parts: &Statements, node: ExprId, duration: f64, solver: &Solver, is_rig: bool) -> Option<f64> {
+        let given: Vec<&Expr> = parts.records.iter().filter_map(|record| record.every.as_ref()).collect();
+        if let [first, again, ..] = given[..] {
+            let error = Diagnostic::error("E0301", "the rows of the data have one distance")
+                .label(again.span, "again here")
+                .label(first.span, "first here");
+            self.diagnostics.push(error.help("write `every` once, or another experiment"));
+        }
+        let (span, reported) = (self.system.span(node), self.diagnostics.len());
+        let every = self.time(node, "the distance of rows");
+        if self.diagnostics.len() > reported {
+            return None;
+        }
+        if is_rig {
+            let error = Diagnostic::error("E0905", "the data of a rig's dry run have a row for each tick");
+            self.diagnostics.push(error.label(span, "no other distance is possible").help("leave `every` out"));
+            return None;
+        }
+        if every > duration * (1.0 + 1e-9) {
+            let error = Diagnostic::error(
+                "E0902",
+                format!("rows every {} in a run of {}", shown(every, 3), shown(duration, 3)),
+            );
+            let error = error.label(span, "longer than the run");
+            self.diagnostics.push(error.help("take a shorter time, or `show final(x)` for the last value"));
+            return None;
+        }
+        if duration / every > MOST_ROWS {
+            let rows = abi::format::three_digits(duration / every);
+            let error =
+                Diagnostic::error("E0902", format!("{rows} rows are too many")).label(span, "so short a distance");
+            self.diagnostics.push(error.help("ten million are possible: take a longer time"));
+            return None;
+        }
+        if solver.method != Method::Adaptive && !live::is_multiple(every, solver.step) {
+            let error = Diagnostic::error("E0701", live::no_multiple(every, solver.step))
+                .label(span, "rows fall on whole steps");
+            self.diagnostics.push(error.help("take a whole multiple of the step"));
+            return None;
+        }
+        Some(every)
     }
 
     /// Default display unit of an expression: that of a plain quantity, otherwise SI.

@@ -155,6 +155,7 @@ impl Varying {
         let (formulas, size) = formulas(&system, &types, &exprs);
         let expects = experiment.expects.len();
         let plots = std::mem::take(&mut experiment.plots);
+        (experiment.records, experiment.every) = (Vec::new(), None);
         if experiment.solver.method != Method::Adaptive {
             // The code of a fixed step contains constant ranges; `in_code` has removed those that vary.
             let guarded = uses.iter().filter_map(|one| match one {

@@ -180,6 +180,11 @@ fn parts(fit: &ast::Fit) -> Result<Parts<'_>, Vec<Diagnostic>> {
                     Diagnostic::error("E0905", "a fit cannot sweep yet").label(one.span, "several laws at once");
                 diagnostics.push(error.help("write a fit for each law"));
             }
+            FitStatement::Experiment(ExperimentStatement::Record(one)) => {
+                let error =
+                    Diagnostic::error("E0905", "a fit writes what it compares").label(one.span, "not for a fit");
+                diagnostics.push(error.help("write an experiment with the fitted model, and `record` in it"));
+            }
             FitStatement::Experiment(
                 ExperimentStatement::Solver(_)
                 | ExperimentStatement::Plot(_)

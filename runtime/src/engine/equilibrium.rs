@@ -71,6 +71,8 @@ pub fn settle(instance: Instance, tol: f64, watch: &mut dyn FnMut(f64) -> Contin
             solver,
             bench: None,
             plots,
+            records: Vec::new(),
+            every: None,
             expects,
             corners,
             stepped: false,

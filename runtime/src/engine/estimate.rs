@@ -82,7 +82,7 @@ fn accompanied<'a>(
     if experiment.expects.is_empty() {
         return None;
     }
-    let bare = Experiment { plots: Vec::new(), ..experiment.clone() };
+    let bare = experiment.unrecorded();
     let adaptive = instance.adaptive().filter(|_| experiment.solver.method != Method::Adaptive);
     let mut companions = Companions { instance, adaptive, bare, runs: Vec::new(), stepped: Vec::new() };
     companions.runs.push((experiment.solver, Ok(outcome.verdicts.clone())));

@@ -51,7 +51,7 @@ pub fn instants(every: f64, experiment: &Experiment) -> Result<Vec<f64>, String>
     Ok((0..=last as u64).map(|k| instant(k).min(duration)).collect())
 }
 
-/// Repeats the experiment and records its plots at these instants, up to where it ended, and how it ended.
+/// Repeats the experiment and records its data at these instants, up to where it ended, and how it ended.
 ///
 /// # Panics
 /// As [`crate::engine::run`].
@@ -61,7 +61,7 @@ pub fn record(
     instants: &[f64],
     watch: &mut dyn FnMut(f64) -> Continue,
 ) -> (Recording, Result<(), Failure>) {
-    let recorder = Recorder::new(&experiment.plots);
+    let recorder = Recorder::new(&experiment.plots, &experiment.records);
     let slots: Vec<_> = recorder.slots().collect();
     let (values, result) = sample(instance, experiment, instants, &slots, watch);
     (recorder.rows(instants, &values), result)

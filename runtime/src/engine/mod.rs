@@ -81,7 +81,7 @@ pub fn sample(
 /// Most numbers that a recording of every step holds: 400 MB.
 pub const MOST_NUMBERS: usize = 50_000_000;
 
-/// Repeats the experiment and records its plots at every step, up to where it ended, and how it ended. `None` if that is
+/// Repeats the experiment and records its data at every step, up to where it ended, and how it ended. `None` if that is
 /// more than [`MOST_NUMBERS`].
 ///
 /// # Panics
@@ -93,14 +93,14 @@ pub fn every_step(
 ) -> (Option<Recording>, Result<(), Failure>) {
     let bare = Experiment { expects: Vec::new(), ..experiment.clone() };
     let mut observer = Observer::new(&bare);
-    observer.recorder = Recorder::whole(&bare.plots, MOST_NUMBERS);
+    observer.recorder = Recorder::whole(&bare.plots, &bare.records, MOST_NUMBERS);
     let (rest, result) = go(instance, &bare, observer, &mut |_| (), watch);
     (rest.observer.recorder.all(), result.map_err(failed))
 }
 
 /// The experiment without measures and recordings.
 fn bare(experiment: &Experiment) -> Experiment {
-    Experiment { plots: Vec::new(), expects: Vec::new(), ..experiment.clone() }
+    Experiment { expects: Vec::new(), ..experiment.unrecorded() }
 }
 
 /// A failure of a run that records nothing.

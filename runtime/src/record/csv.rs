@@ -81,7 +81,7 @@ mod tests {
             against: Some(series("fr.stick", 5, "1", true)),
             view: View::default(),
         };
-        let mut recorder = Recorder::new(&[plot]);
+        let mut recorder = Recorder::new(&[plot], &[]);
         recorder.see(0.0, &[0.0, 0.0, 0.0, 0.25, 1.0 / 3.0, 1.0]);
         recorder.see(1e-5, &[0.0, 0.0, 0.0, -0.001, 1e-20, 0.0]);
         recorder.recording()

@@ -96,11 +96,12 @@ pub struct Recorder {
 }
 
 impl Recorder {
-    /// Records every series of these plots once.
-    pub fn new(plots: &[Plot]) -> Recorder {
+    /// Records every series of the data and of these plots once.
+    pub fn new(plots: &[Plot], records: &[Series]) -> Recorder {
         let mut columns: Vec<Column> = Vec::new();
         let mut slots = Vec::new();
-        for series in plots.iter().flat_map(|plot| plot.series.iter().chain(&plot.against)) {
+        let drawn = plots.iter().flat_map(|plot| plot.series.iter().chain(&plot.against));
+        for series in records.iter().chain(drawn) {
             let column = Column::of(series);
             if !columns.contains(&column) {
                 columns.push(column);
@@ -110,13 +111,16 @@ impl Recorder {
         let last = vec![0.0; slots.len() + 2];
         let after = plots.iter().map(|plot| plot.view.after.unwrap_or(f64::NEG_INFINITY));
         let before = plots.iter().map(|plot| plot.view.before.unwrap_or(f64::INFINITY));
-        let window = (after.fold(f64::INFINITY, f64::min), before.fold(f64::NEG_INFINITY, f64::max));
+        let window = match records {
+            [] => (after.fold(f64::INFINITY, f64::min), before.fold(f64::NEG_INFINITY, f64::max)),
+            _ => (f64::NEG_INFINITY, f64::INFINITY),
+        };
         Recorder { columns, slots, buckets: Vec::new(), capacity: 1, filled: 1, seen: 0, last, every: None, window }
     }
 
     /// The same, and keeps every point of the run, as long as these are at most `most` numbers.
-    pub fn whole(plots: &[Plot], most: usize) -> Recorder {
-        Recorder { every: Some((Vec::new(), most)), ..Recorder::new(plots) }
+    pub fn whole(plots: &[Plot], records: &[Series], most: usize) -> Recorder {
+        Recorder { every: Some((Vec::new(), most)), ..Recorder::new(plots, records) }
     }
 
     /// The recording of every point; `None` if it would have been too large.
@@ -241,10 +245,13 @@ mod tests {
     fn recorder() -> Recorder {
         let series =
             |label: &str, slot| Series { label: label.into(), slot: Slot(slot), unit: Unit::none(), boolean: false };
-        Recorder::new(&[
-            Plot { series: vec![series("a", 3), series("b", 4)], against: None, view: View::default() },
-            Plot { series: vec![series("a", 3)], against: Some(series("b", 4)), view: View::default() },
-        ])
+        Recorder::new(
+            &[
+                Plot { series: vec![series("a", 3), series("b", 4)], against: None, view: View::default() },
+                Plot { series: vec![series("a", 3)], against: Some(series("b", 4)), view: View::default() },
+            ],
+            &[],
+        )
     }
 
     fn record(points: u64, quantities: impl Fn(f64) -> (f64, f64)) -> Recording {

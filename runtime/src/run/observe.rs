@@ -64,7 +64,7 @@ impl Observer {
         }
         let mut expectations = Expectations::new(&expects);
         expectations.jumps_at(&experiment.corners);
-        let recorder = Recorder::new(&experiment.plots);
+        let recorder = Recorder::new(&experiment.plots, &experiment.records);
         let mut slots: Vec<Slot> = expectations.slots().chain(recorder.slots()).collect();
         slots.sort();
         slots.dedup();

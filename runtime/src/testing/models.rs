@@ -321,6 +321,8 @@ pub fn fixed(duration: f64, step: f64) -> Experiment {
         solver,
         bench: None,
         plots: Vec::new(),
+        records: Vec::new(),
+        every: None,
         expects: Vec::new(),
         corners: Vec::new(),
         stepped: false,

@@ -163,7 +163,9 @@ fn experiment<'a>(
                     let _ = writeln!(out, "{}", slice(one.span));
                 }
             }
-            FitStatement::Experiment(ExperimentStatement::Sweep(_)) => unreachable!("a fit has no sweep"),
+            FitStatement::Experiment(ExperimentStatement::Sweep(_) | ExperimentStatement::Record(_)) => {
+                unreachable!("a fit has no sweep and no record")
+            }
         }
     }
     let _ = writeln!(out, "solver {}", solver.unwrap_or_else(|| as_text(&fitted.solver)));

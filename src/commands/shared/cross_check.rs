@@ -200,8 +200,7 @@ pub fn cross(
 fn compared(case: &Case, other: &Case) -> Crossed {
     let solvers = [case.experiment.solver, other.experiment.solver];
     let go_on = &mut |_| Continue::Continue(());
-    let ended =
-        engine::run(other.instance.clone(), &Experiment { plots: Vec::new(), ..other.experiment.clone() }, go_on);
+    let ended = engine::run(other.instance.clone(), &other.experiment.unrecorded(), go_on);
     let partner = ended.map(|Outcome { verdicts, .. }| verdicts);
     let crossed = |rows, partner| Crossed { label: case.label.clone(), solvers, rows, partner, advice: None };
     if partner.is_err() {

@@ -113,6 +113,7 @@ pub(super) fn statements(loaded: &Loaded, name: &str, duration: Option<f64>) -> 
             S::Plot(one) => one.span,
             S::Tune(_, span) => *span,
             S::Expect(one) => one.span,
+            S::Record(one) => one.span,
             S::Allow(one) => one.span,
         };
         out.push(loaded.files.slice(span).trim().to_string());
