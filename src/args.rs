@@ -560,8 +560,8 @@ pub struct Build {
     /// Form of the output of a model or an experiment; a rig becomes a package
     #[arg(long, value_name = "WHAT", value_enum)]
     pub emit: Option<Emit>,
-    /// File to write [default: the standard output]
-    #[arg(long, short, value_name = "FILE", value_hint = ValueHint::FilePath)]
+    /// File to write [default: the standard output]; a folder, such as c/, gets C code with a header
+    #[arg(long, short, value_name = "FILE|FOLDER/", value_hint = ValueHint::AnyPath)]
     pub out: Option<PathBuf>,
     /// Sign a package with a secret key, into a file beside it
     #[arg(long, value_name = "FILE.key", value_hint = ValueHint::FilePath)]

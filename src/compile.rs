@@ -12,6 +12,7 @@ pub use compiler::analysis::linearise::{Linear, Matrices, Ports};
 pub use compiler::analysis::step_stability::largest_stable;
 pub use compiler::analysis::step_stability_report::stable_up_to;
 pub use compiler::analysis::tuning::Tuned;
+pub use compiler::codegen::c::Files as CFiles;
 pub use compiler::codegen::elementary::ElementaryFunction;
 use compiler::codegen::lanes;
 use compiler::codegen::target::{self, FunctionCompiler};
@@ -72,6 +73,7 @@ pub fn emit(
     let description = &built.program.description;
     let told = |error: Unsupported| error.to_string();
     let text = match emit {
+        Emit::C if method == Method::Adaptive => return Err(no_step(description)),
         Emit::C => c::source(&functions, description, &built.program.params),
         Emit::Ir => {
             let listings: Vec<String> = functions.iter().map(|(_, func)| func.to_string()).collect();
@@ -112,6 +114,27 @@ pub fn emit(
         }
     };
     Ok(text.into_bytes())
+}
+
+/// Why an adaptive run has no C code.
+fn no_step(description: &abi::Description) -> String {
+    format!(
+        "`{}` would be run by adaptive steps, which C code does not have: give it fixed ones, with `--solver rk4` or `solver rk4 step 1 ms` in its experiment",
+        description.name
+    )
+}
+
+/// C code with a header.
+///
+/// # Errors
+/// Why there is none, in words.
+pub fn c_files(built: &Built, solver: Option<Method>) -> Result<CFiles, String> {
+    let method = method(built, solver);
+    let description = &built.program.description;
+    if method == Method::Adaptive {
+        return Err(no_step(description));
+    }
+    Ok(c::files(&compiler::functions(&built.program, method), description, &built.program.params))
 }
 
 /// A table of the passes: what each did to the step, and how long it took.

@@ -389,6 +389,76 @@ fn a_model_can_be_exported() {
     assert!(!folder.0.join("x").exists());
 }
 
+/// C code in a folder: two files that compile without warnings, as C and as C++, and compute the bits of the run.
+#[test]
+fn a_model_goes_into_a_folder_with_its_header() {
+    let text =
+        PULL.replace("plot   x [mm], v [mm/s]", "record x [m], v [m/s]\n  allow  discretisation \"its own steps\"");
+    let folder = Folder::new("headed").with("pull.fric", &text);
+    folder.check(&["build", "pull.fric", "holds", "-o", "c/"], 0, "wrote c/pull.c and c/pull.h");
+    let header = fs::read_to_string(folder.0.join("c/pull.h")).unwrap();
+    for wanted in
+        ["double fr_Fc;", "/* parameter, N, from 0 */", "pull_t;", "uint64_t pull_step(pull_t *m, uint64_t count);"]
+    {
+        assert!(header.contains(wanted), "{wanted}: {header}");
+    }
+    let main = "#include \"c/pull.h\"\n#include <stdio.h>\nint main(void)\n{\n    pull_t m;\n    pull_defaults(&m);\n    \
+                m.h = 0.001;\n    pull_start(&m);\n    for (int k = 0; k < 2000; k++) if (pull_step(&m, 1)) return 1;\n    \
+                printf(\"%.17g %.17g\", m.x, m.v);\n    return 0;\n}\n";
+    fs::write(folder.0.join("main.c"), main).unwrap();
+    fs::write(
+        folder.0.join("use.cpp"),
+        "#include \"c/pull.h\"\nint main() { pull_t m; pull_defaults(&m); return 0; }\n",
+    )
+    .unwrap();
+    let run = |program: &str, args: &[&str]| {
+        let done = Command::new(program).args(args).current_dir(&folder.0).output().expect("it runs");
+        assert!(done.status.success(), "{program} {args:?}: {}", String::from_utf8_lossy(&done.stderr));
+        String::from_utf8(done.stdout).unwrap()
+    };
+    let strict = ["-std=c11", "-O2", "-Wall", "-Wextra", "-pedantic", "-Werror"];
+    run("gcc", &[&strict[..], &["main.c", "c/pull.c", "-o", "pull", "-lm"]].concat());
+    run("g++", &["-std=c++17", "-Wall", "-Wextra", "-Werror", "-c", "use.cpp", "-o", "use.o"]);
+    let numbers = |text: &str| -> Vec<f64> {
+        text.split([' ', ',']).map(|number| number.trim().parse().expect("a number")).collect()
+    };
+    let ended = numbers(&run("./pull", &[]));
+    folder.check(&["run", "pull.fric", "holds", "--data", "pull.csv"], 0, "wrote pull.csv");
+    let rows = fs::read_to_string(folder.0.join("pull.csv")).unwrap();
+    assert!(rows.starts_with("t [s],x [m],v [m/s]\n"), "{rows}");
+    assert_eq!(numbers(rows.lines().last().unwrap())[1..], ended[..], "the bits of the simulation");
+    // A field after a memory without a name, and one whose name C has taken.
+    let late = "model Late {\n  input  u [m]\n  output double [m] = delay(u, 5 ms)\n  output z [m] = 2 * double\n}\n";
+    fs::write(folder.0.join("late.fric"), late).unwrap();
+    folder.check(&["build", "late.fric", "--step", "1ms", "-o", "c"], 0, "wrote c/late.c and c/late.h");
+    run("gcc", &[&strict[..], &["-c", "c/late.c", "-o", "late.o"]].concat());
+    let header = fs::read_to_string(folder.0.join("c/late.h")).unwrap();
+    assert!(header.contains("double memory_") && header.contains("double double_;"), "{header}");
+    // Only C goes into a folder, and only what has a step.
+    folder.check(&["build", "pull.fric", "holds", "--emit", "ir", "-o", "c/"], 2, "c/ is a folder");
+    for out in [&["-o", "c/"][..], &["--emit", "c"]] {
+        let all = [&["build", "pull.fric", "Pull", "--solver", "adaptive"], out].concat();
+        folder.check(&all, 1, "give it fixed ones, with `--solver rk4`");
+    }
+}
+
+/// What an experiment records is written without a plot, as often as it says.
+#[test]
+fn an_experiment_records_without_a_plot() {
+    let text = PULL.replace("plot   x [mm], v [mm/s]", "record x [mm], fr.F every 0.5 s");
+    let folder = Folder::new("recorded").with("pull.fric", &text);
+    let (said, _) = folder.check(&["run", "pull.fric", "holds"], 0, "wrote out/holds.csv");
+    assert!(!said.contains("svg"), "{said}");
+    let rows = fs::read_to_string(folder.0.join("out/holds.csv")).unwrap();
+    let lines: Vec<&str> = rows.lines().collect();
+    assert_eq!((lines.len(), lines[0]), (6, "t [s],x [mm],fr.F [N]"), "{rows}");
+    folder.check(&["run", "pull.fric", "holds", "--every", "1s", "--data", "-"], 0, "\n2,");
+    let (every, _) = folder.check(&["run", "pull.fric", "holds", "--every", "1s", "--data", "-"], 0, "");
+    assert_eq!(every.lines().count(), 4, "{every}");
+    folder.check(&["run", "pull.fric", "holds", "--plot", "x.svg"], 1, "add `plot` with what to draw");
+    folder.check(&["run", "pull.fric", "breaks", "--data", "x.csv"], 1, "add `record` with what to record");
+}
+
 /// Listings name the slots of the block, contain one function after the other, and show the code that runs: expanded,
 /// fused, without calls except of the function itself for more than one iteration.
 #[test]
@@ -507,9 +577,10 @@ fn an_experiment_can_be_changed_from_outside() {
 #[test]
 fn files_that_would_hold_nothing_are_refused() {
     let folder = Folder::new("nothing").with("pull.fric", PULL);
-    for (option, file) in [("--data", "a.csv"), ("--plot", "a.svg")] {
+    for (option, file, does, word) in [("--data", "a.csv", "records", "record"), ("--plot", "a.svg", "draws", "plot")] {
         let (_, err) = folder.check(&["run", "pull.fric", "breaks", option, file], 1, "");
-        assert!(err.contains(&format!("{option} has nothing to write: `breaks` records nothing; add `plot`")), "{err}");
+        let wanted = format!("{option} has nothing to write: `breaks` {does} nothing; add `{word}`");
+        assert!(err.contains(&wanted), "{err}");
     }
     assert_eq!(folder.names("."), ["pull.fric"]);
     folder.check(&["run", "pull.fric", "breaks", "--out", "a"], 1, "nothing to write: the experiment has no `plot`");

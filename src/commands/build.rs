@@ -6,11 +6,13 @@ use crate::compile::{self, Emit, Stopwatch};
 use crate::project;
 use crate::terminal::Terminal;
 use grammar::diagnostic::Diagnostic;
+use std::path::Path;
 
 pub fn build(args: &Build, terminal: &mut Terminal) -> End {
     let packs =
         args.out.as_ref().is_some_and(|out| out.extension().is_some_and(|it| it == runtime::package::EXTENSION));
-    let emit = match (args.emit, packs) {
+    let folder = args.out.as_ref().filter(|out| out.is_dir() || out.to_string_lossy().ends_with('/'));
+    let emit = match (args.emit.or(folder.map(|_| Emit::C)), packs) {
         (None, true) => return crate::commands::shared::package::build(args, terminal),
         (Some(emit), false) if args.sign.is_none() => emit,
         (Some(_), false) => {
@@ -23,11 +25,15 @@ pub fn build(args: &Build, terminal: &mut Terminal) -> End {
         }
         (None, false) => {
             terminal.error(
-                "make what? --emit c, ir, passes, clif, asm or blob; a rig becomes a package with --out NAME.fricpkg",
+                "make what? --emit c, ir, passes, clif, asm or blob; C with a header with --out FOLDER/; a rig becomes a package with --out NAME.fricpkg",
             );
             return End::Misused;
         }
     };
+    if let Some(folder) = folder.filter(|_| emit != Emit::C) {
+        terminal.error(&format!("{} is a folder: only C code goes into one; name a file", folder.display()));
+        return End::Misused;
+    }
     if !args.features.is_empty() && !matches!(emit, Emit::Blob | Emit::Asm) {
         terminal.error("--features is for machine code: --emit blob or asm, or a package");
         return End::Misused;
@@ -81,6 +87,9 @@ pub fn build(args: &Build, terminal: &mut Terminal) -> End {
         terminal.error(&format!("`{name}` has {each}: how much of the past is kept depends on the step; give it with --step, such as --step 1ms"));
         return End::Misused;
     }
+    if let Some(folder) = folder {
+        return in_folder(folder, compile::c_files(&built, args.stepped.solver), terminal);
+    }
     let bytes = match compile::emit(&built, emit, args.stepped.solver, args.target, &args.features) {
         Ok(bytes) => bytes,
         Err(why) => {
@@ -97,5 +106,27 @@ pub fn build(args: &Build, terminal: &mut Terminal) -> End {
         return End::Failed;
     }
     terminal.report(&format!("wrote {}, {} bytes\n", out.display(), crate::quantity::count(bytes.len() as u64)));
+    End::Fine
+}
+
+/// Writes C code and its header into a folder.
+fn in_folder(folder: &Path, files: Result<compile::CFiles, String>, terminal: &Terminal) -> End {
+    let files = match files {
+        Ok(files) => files,
+        Err(why) => {
+            terminal.error(&why);
+            return End::Failed;
+        }
+    };
+    let mut written = Vec::new();
+    for (ending, text) in [("c", &files.source), ("h", &files.header)] {
+        let path = folder.join(format!("{}.{ending}", files.name));
+        if let Err(error) = project::write(&path, text.as_bytes()) {
+            terminal.error(&format!("cannot write {}: {error}", path.display()));
+            return End::Failed;
+        }
+        written.push(path.display().to_string());
+    }
+    terminal.report(&format!("wrote {}\n", written.join(" and ")));
     End::Fine
 }

@@ -7,7 +7,8 @@
 
 use crate::ir::hash::{HashMap, HashSet};
 use crate::ir::{Func, Op, Type, Value, verify};
-use abi::description::Kind;
+use abi::description::{Kind, TINY};
+use abi::format::significant;
 use abi::unit::Unit;
 use abi::{Description, Function, Slot};
 use std::collections::BTreeSet;
@@ -21,17 +22,71 @@ const MAX_INLINE: usize = 72;
 /// # Panics
 /// If a function does not verify or is not expanded: a mistake of an earlier pass.
 pub fn source(functions: &[(Function, Func)], description: &Description, params: &[f64]) -> String {
+    written(functions, description, params, Form::Alone).1
+}
+
+/// The two files of a model.
+pub struct Files {
+    /// Their name, without ending.
+    pub name: String,
+    /// `NAME.c`
+    pub source: String,
+    /// `NAME.h`: the instance as a struct, whose fields carry unit and range, and the functions.
+    pub header: String,
+}
+
+/// As [`source`], with a header: functions take the instance in place of its block.
+///
+/// # Panics
+/// As [`source`].
+pub fn files(functions: &[(Function, Func)], description: &Description, params: &[f64]) -> Files {
+    let (names, source) = written(functions, description, params, Form::Headed);
+    let header = header(functions, description, &names);
+    Files { name: names.prefix, source, header }
+}
+
+/// What functions take.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Form {
+    /// The block.
+    Alone,
+    /// The instance, which a header declares.
+    Headed,
+}
+
+impl Form {
+    /// The first parameter of each function.
+    fn parameter(self, prefix: &str) -> String {
+        match self {
+            Form::Alone => "double *block".into(),
+            Form::Headed => format!("{prefix}_t *m"),
+        }
+    }
+
+    /// The first line of each function.
+    fn begin(self, used: bool) -> &'static str {
+        match (self, used) {
+            (Form::Alone, true) => "",
+            (Form::Alone, false) => "    (void)block;\n",
+            (Form::Headed, true) => "    double *const block = m->block;\n",
+            (Form::Headed, false) => "    (void)m;\n",
+        }
+    }
+}
+
+fn written(functions: &[(Function, Func)], description: &Description, params: &[f64], form: Form) -> (Names, String) {
     let names = Names::new(description);
     let mut helpers = BTreeSet::new();
     let mut tables = BTreeSet::new();
     let mut bodies = String::new();
     for (function, func) in functions {
         let mut writer = Writer::new(func, &names, &mut helpers, &mut tables);
-        bodies += &writer.function(*function);
+        bodies += &writer.function(*function, form);
     }
-    let step = functions.iter().find(|(function, _)| *function == Function::Step);
-    let timeless = step.is_some_and(|(_, func)| func.stores.iter().all(|(slot, _)| *slot != Slot::TIME));
-    let mut out = heading(description, &names, timeless);
+    let mut out = heading(description, &names, timeless(functions), form);
+    if form == Form::Headed {
+        out += &same_layout(&names);
+    }
     for helper in &helpers {
         out += &format!("\n{}\n", helper.source());
     }
@@ -45,16 +100,27 @@ pub fn source(functions: &[(Function, Func)], description: &Description, params:
         out += "};\n";
     }
     let prefix = &names.prefix;
-    for (function, _) in functions {
-        out += &format!("\nuint64_t {};", signature(prefix, *function));
+    let parameter = form.parameter(prefix);
+    if form == Form::Alone {
+        for (function, _) in functions {
+            out += &format!("\nuint64_t {};", signature(prefix, *function, form));
+        }
+        out += &format!("\nvoid {prefix}_defaults({parameter});\n");
     }
-    out += &format!("\nvoid {prefix}_defaults(double *block);\n");
-    out += &format!("\n/* Zeros, and the defaults of the parameters. */\nvoid {prefix}_defaults(double *block)\n{{\n");
+    out += &format!("\n/* Zeros, and the defaults of the parameters. */\nvoid {prefix}_defaults({parameter})\n{{\n");
+    out += form.begin(true);
     out += &format!("    for (int k = 0; k < {}; k++) block[k] = 0.0;\n", names.count());
     for (k, value) in params.iter().enumerate() {
         out += &format!("    block[{}] = {};\n", names.slot(description.layout.params.slot(k)), real(*value));
     }
-    out + "}\n" + &bodies
+    let out = out + "}\n" + &bodies;
+    (names, out)
+}
+
+/// Whether no step stores the time.
+fn timeless(functions: &[(Function, Func)]) -> bool {
+    let step = functions.iter().find(|(function, _)| *function == Function::Step);
+    step.is_some_and(|(_, func)| func.stores.iter().all(|(slot, _)| *slot != Slot::TIME))
 }
 
 /// The purpose of a function, for a comment in the file.
@@ -78,45 +144,220 @@ fn purpose(function: Function) -> &'static str {
     }
 }
 
-fn signature(prefix: &str, function: Function) -> String {
+fn signature(prefix: &str, function: Function, form: Form) -> String {
+    let parameter = form.parameter(prefix);
     match function {
-        Function::Step => format!("{prefix}_step(double *block, uint64_t count)"),
-        other => format!("{prefix}_{}(double *block)", other.name()),
+        Function::Step => format!("{prefix}_step({parameter}, uint64_t count)"),
+        other => format!("{prefix}_{}({parameter})", other.name()),
     }
 }
 
-/// The head of the file: how to use the code, and the layout of the block. `timeless`: no step stores the time.
-fn heading(description: &Description, names: &Names, timeless: bool) -> String {
+/// The header: the instance and the functions.
+fn header(functions: &[(Function, Func)], description: &Description, names: &Names) -> String {
     let prefix = &names.prefix;
+    let guard = format!("{}_H", prefix.to_uppercase());
     let mut out = format!(
-        "/* {}\n\n   The numbers of an instance lie in a block of {} doubles, SI units, at the places named below.\n   \
-         To begin: {prefix}_defaults(block), set what differs, block[{}] = step in s, {prefix}_start(block).\n   \
-         Compile with -std=c11 or -ffp-contract=off, and without -ffast-math: then every bit is that of the\n   \
-         simulation. Link with -lm. */\n",
+        "/* {}\n\n   All numbers are in SI units. To begin:\n\n     {prefix}_t m;\n     {prefix}_defaults(&m);\n     \
+         m.h = 0.001;                 the step in s, and parameters that differ\n     {prefix}_start(&m);\n\n   \
+         then at each step: set the inputs, call {prefix}_step(&m, 1), read the outputs.\n   \
+         Compile {prefix}.c with -std=c11 or -ffp-contract=off, without -ffast-math, and link with -lm: then every bit\n   \
+         is that of the simulation. */\n",
         comment(&description.name),
-        description.layout.size(),
-        names.slot(Slot::STEP),
     );
-    out += "#include <float.h>\n#include <math.h>\n#include <stdint.h>\n#include <string.h>\n\n";
-    out += "#ifdef __FAST_MATH__\n#error \"-ffast-math would change the results\"\n#endif\n";
-    out += "#if FLT_EVAL_METHOD != 0\n#error \"doubles must be computed as doubles\"\n#endif\n";
-    out += "\n/* Places of the block. */\nenum {\n";
+    out += &format!("#ifndef {guard}\n#define {guard}\n\n#include <stdint.h>\n\n");
+    out += "#ifdef __cplusplus\nextern \"C\" {\n#endif\n\n";
+    out += "/* An instance: its numbers by name, and as the block that the functions work on. */\n";
+    out += "typedef union {\n    struct {\n";
+    let notes = notes(description, timeless(functions), true);
+    let fields = fields(names, &notes);
+    let width = fields.iter().map(|(field, _)| field.len()).max().unwrap_or(0);
+    for (field, note) in &fields {
+        match note {
+            Some(note) => writeln!(out, "        double {field:<width$}  /* {note} */"),
+            None => writeln!(out, "        double {field}"),
+        }
+        .expect("writing to a string does not fail");
+    }
+    out += &format!("    }};\n    double block[{}];\n}} {prefix}_t;\n\n", names.slots.len());
+    out += &format!("/* Zeros, and the defaults of the parameters. */\nvoid {prefix}_defaults({prefix}_t *m);\n");
+    for (function, _) in functions {
+        let comment = purpose(*function);
+        out += &format!("\n/* {comment} */\nuint64_t {};\n", signature(prefix, *function, Form::Headed));
+    }
+    let has_step = functions.iter().any(|(function, _)| *function == Function::Step);
+    if has_step && !description.guards.is_empty() {
+        out += "\n/* What a step returns: the number of the first quantity that is not finite or has left its range.\n";
+        for (k, guard) in description.guards.iter().enumerate() {
+            let range = range(guard.range).unwrap_or_else(|| "finite".into());
+            let unit = Unit::si(guard.unit.dimension).text;
+            let unit = if unit.is_empty() || range == "finite" { String::new() } else { format!(" {unit}") };
+            out += &format!("   {:>4}  {}: {range}{unit}\n", k + 1, comment(&guard.path));
+        }
+        out += "*/\n";
+    }
+    out + "\n#ifdef __cplusplus\n}\n#endif\n\n#endif\n"
+}
+
+/// A range in SI units in words; `None` if it is open.
+fn range((low, high): (f64, f64)) -> Option<String> {
+    let number = |x: f64| if x.abs() == TINY { "0".to_string() } else { significant(x, 6) };
+    Some(match (low.is_finite(), high.is_finite()) {
+        (true, true) => format!("{} .. {}", number(low), number(high)),
+        (true, false) if low == TINY => "above 0".into(),
+        (true, false) => format!("from {}", number(low)),
+        (false, true) if high == -TINY => "below 0".into(),
+        (false, true) => format!("up to {}", number(high)),
+        (false, false) => return None,
+    })
+}
+
+/// The fields of the struct with their notes; runs of slots without a name are arrays.
+fn fields(names: &Names, notes: &HashMap<Slot, String>) -> Vec<(String, Option<String>)> {
+    let mut out = Vec::new();
+    let mut at = 0;
+    while at < names.slots.len() {
+        let nameless = |at: usize| names.nameless.get(at).copied().unwrap_or(false);
+        let run = (at..names.slots.len()).take_while(|&at| nameless(at)).count();
+        if run > 1 {
+            out.push((format!("memory_{at}[{run}];"), None));
+            at += run;
+            continue;
+        }
+        out.push((format!("{};", field(names, at)), notes.get(&Slot(at as u32)).cloned()));
+        at += 1;
+    }
+    out
+}
+
+/// An assertion for the C compiler that the last named field lies where the functions look for it.
+fn same_layout(names: &Names) -> String {
+    let named = |at: &usize| !names.nameless[*at];
+    let Some(last) = (0..names.slots.len()).rev().find(named) else { return String::new() };
+    let (prefix, slot) = (&names.prefix, &names.slots[last]);
+    let field = field(names, last);
+    format!(
+        "\n_Static_assert(offsetof({prefix}_t, {field}) == {slot} * sizeof(double), \"the struct is the block\");\n"
+    )
+}
+
+/// The name of a field.
+fn field(names: &Names, at: usize) -> String {
+    let name = &names.slots[at][names.prefix.len() + 1..];
+    if RESERVED.contains(&name) { format!("{name}_") } else { name.to_string() }
+}
+
+/// Words of C and C++ that no field may have as its name.
+const RESERVED: [&str; 62] = [
+    "auto",
+    "break",
+    "case",
+    "char",
+    "const",
+    "continue",
+    "default",
+    "do",
+    "double",
+    "else",
+    "enum",
+    "extern",
+    "float",
+    "for",
+    "goto",
+    "if",
+    "inline",
+    "int",
+    "long",
+    "register",
+    "restrict",
+    "return",
+    "short",
+    "signed",
+    "sizeof",
+    "static",
+    "struct",
+    "switch",
+    "typedef",
+    "union",
+    "unsigned",
+    "void",
+    "volatile",
+    "while",
+    "and",
+    "bool",
+    "catch",
+    "class",
+    "delete",
+    "explicit",
+    "export",
+    "false",
+    "friend",
+    "mutable",
+    "namespace",
+    "new",
+    "not",
+    "operator",
+    "or",
+    "private",
+    "protected",
+    "public",
+    "template",
+    "this",
+    "throw",
+    "true",
+    "try",
+    "typename",
+    "using",
+    "virtual",
+    "xor",
+    "block",
+];
+
+/// Notes on the slots of a block; `ranges`: with their ranges.
+fn notes(description: &Description, timeless: bool, ranges: bool) -> HashMap<Slot, String> {
     let mut notes: HashMap<Slot, String> = HashMap::default();
     for quantity in &description.quantities {
         let doc = quantity.doc.as_ref().and_then(|doc| doc.lines().next()).unwrap_or_default();
         let unit = if quantity.boolean { "true 1, false 0".into() } else { Unit::si(quantity.unit.dimension).text };
-        let what = [kind(quantity.kind), &unit, doc].map(str::trim).into_iter().filter(|part| !part.is_empty());
+        let range = range(quantity.range).filter(|_| ranges && !quantity.boolean).unwrap_or_default();
+        let what = [kind(quantity.kind), &unit, &range, doc].map(str::trim).into_iter().filter(|part| !part.is_empty());
         notes.entry(quantity.slot).or_insert_with(|| comment(&what.collect::<Vec<_>>().join(", ")));
     }
+    let time = if timeless { "time, s: for you to keep, no equation reads it" } else { "time, s" };
+    for (slot, note) in [(Slot::TIME, time), (Slot::STEP, "fixed step, s"), (Slot::COUNT, "steps since the start")] {
+        notes.insert(slot, note.into());
+    }
+    notes
+}
+
+/// The head of the file: how to use the code, and the layout of the block. `timeless`: no step stores the time.
+fn heading(description: &Description, names: &Names, timeless: bool, form: Form) -> String {
+    let prefix = &names.prefix;
+    let mut out = match form {
+        Form::Headed => format!("/* {}: see {prefix}.h */\n", comment(&description.name)),
+        Form::Alone => format!(
+            "/* {}\n\n   The numbers of an instance lie in a block of {} doubles, SI units, at the places named below.\n   \
+         To begin: {prefix}_defaults(block), set what differs, block[{}] = step in s, {prefix}_start(block).\n   \
+         Compile with -std=c11 or -ffp-contract=off, and without -ffast-math: then every bit is that of the\n   \
+         simulation. Link with -lm. */\n",
+            comment(&description.name),
+            description.layout.size(),
+            names.slot(Slot::STEP),
+        ),
+    };
+    if form == Form::Headed {
+        out += &format!("#include \"{prefix}.h\"\n");
+    }
+    if form == Form::Headed {
+        out += "#include <stddef.h>\n";
+    }
+    out += "#include <float.h>\n#include <math.h>\n#include <stdint.h>\n#include <string.h>\n\n";
+    out += "#ifdef __FAST_MATH__\n#error \"-ffast-math would change the results\"\n#endif\n";
+    out += "#if FLT_EVAL_METHOD != 0\n#error \"doubles must be computed as doubles\"\n#endif\n";
+    out += "\n/* Places of the block. */\nenum {\n";
+    let notes = notes(description, timeless, false);
     let width = names.slots.iter().map(String::len).max().unwrap_or(0);
     for (at, name) in names.slots.iter().enumerate() {
-        let notes = match Slot(at as u32) {
-            Slot::TIME if timeless => Some("time, s: for you to keep, no equation reads it".to_string()),
-            Slot::TIME => Some("time, s".to_string()),
-            Slot::STEP => Some("fixed step, s".into()),
-            Slot::COUNT => Some("steps since the start".into()),
-            slot => notes.get(&slot).cloned(),
-        };
+        let notes = notes.get(&Slot(at as u32));
         match notes {
             Some(notes) => writeln!(out, "    {name:<width$} = {at},  /* {notes} */"),
             None => writeln!(out, "    {name:<width$} = {at},"),
@@ -148,6 +389,8 @@ fn comment(text: &str) -> String {
 struct Names {
     prefix: String,
     slots: Vec<String>,
+    /// Which of them belong to no quantity.
+    nameless: Vec<bool>,
 }
 
 impl Names {
@@ -179,8 +422,9 @@ impl Names {
             taken.insert(name.clone());
             format!("{}_{name}", prefix.to_uppercase())
         };
+        let nameless = wanted.iter().map(Option::is_none).collect();
         let slots = wanted.into_iter().enumerate().map(name).collect();
-        Names { prefix, slots }
+        Names { prefix, slots, nameless }
     }
 
     fn slot(&self, slot: Slot) -> &str {
@@ -353,7 +597,7 @@ impl<'a> Writer<'a> {
         }
     }
 
-    fn function(&mut self, function: Function) -> String {
+    fn function(&mut self, function: Function, form: Form) -> String {
         let repeated = function == Function::Step;
         let indent = if repeated { "        " } else { "    " };
         let mut body = String::new();
@@ -401,10 +645,8 @@ impl<'a> Writer<'a> {
                 .expect("writing to a string does not fail");
         }
         let mut out =
-            format!("\n/* {} */\nuint64_t {}\n{{\n", purpose(function), signature(&self.names.prefix, function));
-        if !body.contains("block") {
-            out += "    (void)block;\n";
-        }
+            format!("\n/* {} */\nuint64_t {}\n{{\n", purpose(function), signature(&self.names.prefix, function, form));
+        out += form.begin(body.contains("block"));
         match (repeated, status.is_some()) {
             (true, true) => {
                 out += &format!(
