@@ -602,7 +602,7 @@ pub struct Hil {
     /// Changes to the text
     #[command(flatten)]
     pub set: Set,
-    /// Inject faults into simulated drives and devices: 'panel.enable = 0 at 5 s'
+    /// Inject faults into simulated drives and devices: 'panel.enable = 0 at 5 s' after power-on, or 'at 5 s of run'
     #[arg(long, value_name = "FAULT")]
     pub inject: Vec<String>,
     /// Do the checks of the start-up and stop before arming
@@ -658,7 +658,7 @@ pub struct Hil {
     pub interpret: bool,
 }
 
-const HIL_HELP: &str = "While it runs, type: enable, arm, set PATH = VALUE, stop.\n\
+const HIL_HELP: &str = "While it runs, type: enable, arm, set PATH = VALUE, mark WORDS, show, help, stop.\n\
     Exit codes: 0 ended as asked (Ctrl-C included), 1 refused or bad input, 2 wrong usage, 3 stopped by safety.";
 
 /// `fric predict`

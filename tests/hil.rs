@@ -324,6 +324,13 @@ fn example() -> String {
     root().join("examples/rtfs/rtfs.fric").display().to_string()
 }
 
+/// The time of the model in the last row of a table of cycles, in s.
+fn model_time(csv: &str) -> f64 {
+    let (head, rows) = csv.split_once('\n').unwrap();
+    let at = head.split(',').position(|name| name == "model t [s]").unwrap();
+    rows.lines().last().unwrap().split(',').nth(at).unwrap().parse().unwrap()
+}
+
 #[test]
 fn a_run_leaves_a_log_that_replays_and_two_equal_runs_leave_equal_logs() {
     let folder = folder("hil-replay");
@@ -339,6 +346,7 @@ fn a_run_leaves_a_log_that_replays_and_two_equal_runs_leave_equal_logs() {
     let csv = fs::read_to_string(folder.join("a.csv")).unwrap();
     assert!(csv.lines().next().unwrap().contains("load.torque permitted"), "{:?}", csv.lines().next());
     assert!(csv.lines().count() > 5000);
+    assert!((model_time(&csv) - 5.0).abs() < 2e-3, "the model ran for 5 s: {}", model_time(&csv));
     let frames = fs::read_to_string(folder.join("a.log")).unwrap();
     assert!(frames.lines().any(|line| line.ends_with(" can0 080#")), "SYNC");
     // A flipped bit and a truncation are detected.
@@ -380,6 +388,13 @@ fn the_cause_of_a_stop_is_reported_with_exit_code_3() {
     assert!(stops("load fault 0x2310 at 8 s").contains("load (node 3)"));
     let said = run(&folder, &["replay", "out/rtfs.friclog"], 0);
     assert!(said.contains("agree to the bit") && said.contains("stopped: load (node 3)"), "{said}");
+    // A time of the run is one of the model.
+    for at in [0.5, 2.25, 6.0] {
+        assert!(stops(&format!("load fault 0x2310 at {at} s of run")).contains("load (node 3)"));
+        run(&folder, &["replay", "out/rtfs.friclog", "--csv", "fault.csv"], 0);
+        let ended = model_time(&fs::read_to_string(folder.join("fault.csv")).unwrap());
+        assert!((at..at + 0.02).contains(&ended), "a fault at {at} s of the model ended it at {ended} s");
+    }
     let no_log = ["hil", "--sim", "--fast", "--for", "20s", "--no-log", "--inject", "servo silent at 14 s", &example];
     run(&folder, &no_log, 3);
     let said = run(&folder, &["replay", "out/rtfs.blackbox.friclog"], 0);
@@ -479,7 +494,7 @@ fn options_for_simulated_drives_are_refused_to_a_drive_that_proves_nothing() {
 fn under_way(folder: &Path, log: &str) -> std::process::Child {
     let example = example();
     let mut command = fric(folder, &["hil", "--sim", "--count-overruns", "--roll", "40kB", "--log", log, &example]);
-    let mut child = command.stdin(Stdio::piped()).stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
+    let mut child = command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
     while !folder.join(log).exists() {
         std::thread::sleep(Duration::from_millis(20));
         assert!(child.try_wait().unwrap().is_none(), "it ended by itself");
@@ -522,8 +537,13 @@ fn parameters_change_while_it_runs_and_the_log_knows() {
     say("set fr.Fs = 0.2 N·m");
     say("set pid.Ts = 1.5 ms");
     say("reset");
+    say("show");
     say("stop");
     let output = child.wait_with_output().unwrap();
+    let answers = String::from_utf8_lossy(&output.stdout);
+    for words in ["  fr.Fs ", " → 0.5 N·m, fr.Fc ", "  fr.Fs = 0.5 N·m", "  fr.Fc = 0.3 N·m"] {
+        assert!(answers.contains(words), "no `{words}` in {answers}");
+    }
     let said = String::from_utf8_lossy(&output.stderr);
     assert_eq!(output.status.code(), Some(0), "{said}");
     for words in [
@@ -538,6 +558,7 @@ fn parameters_change_while_it_runs_and_the_log_knows() {
     }
     let said = run(&folder, &["replay", "log"], 0);
     assert!(said.contains("agree to the bit"), "{said}");
+    assert!(said.contains("  set fr.Fs = 0.5 N·m ") && said.contains("  set fr.Fc = 0.3 N·m "), "{said}");
 }
 
 /// The stability of a contact is checked with the values of a set as at a start, and before a package is built.

@@ -254,14 +254,14 @@ fn in_process(args: &Args, ready: CompiledRig, pace: Pace, asked: Asked, termina
         }
     }
     let (clock, masters) = (world.clock(), world.masters());
-    run(args, ready, clock, masters, Drives::Simulated(pace), asked, terminal)
+    run(args, ready, clock, masters, (Drives::Simulated(pace), Some(&world)), asked, terminal)
 }
 
 /// Runs on the buses of this machine.
 fn on_buses(args: &Args, ready: CompiledRig, asked: Asked, terminal: &mut Terminal) -> End {
     let world = Simulation::real_time();
     match session::buses(&ready.rig, &world) {
-        Ok(buses) => run(args, ready, Box::new(world), buses, Drives::Real, asked, terminal),
+        Ok(buses) => run(args, ready, Box::new(world), buses, (Drives::Real, None), asked, terminal),
         Err(why) => {
             terminal.error(&why);
             terminal.report("  `fric hil --sim` runs the rig with simulated drives\n");
@@ -275,7 +275,7 @@ fn run(
     ready: CompiledRig,
     clock: Box<dyn Clock>,
     buses: Vec<Box<dyn Bus>>,
-    drives: Drives,
+    (drives, simulated): (Drives, Option<&World>),
     asked: Asked,
     terminal: &mut Terminal,
 ) -> End {
@@ -345,6 +345,10 @@ fn run(
         if session.hil.ended() == Some(&cycle::End::Asked) && rows.len() >= asked.drives().len() * 10 {
             measured(asked, &rows, terminal);
         }
+    }
+    if let Some(world) = simulated {
+        session.run_to_model();
+        world.bench().begin_run();
     }
     let end = session.run();
     over.store(true, Ordering::Relaxed);

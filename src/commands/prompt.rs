@@ -9,12 +9,19 @@ use crate::loop_stability;
 use crate::source_snapshot::Kept;
 use crate::terminal::Terminal;
 use abi::Instance;
+use abi::format::quantity;
+use abi::live::{Param, Tunable};
 use grammar::diagnostic::Diagnostic;
 use runtime::hil::live::{Judge, Set};
 use runtime::hil::operator::{Answer, Command, Mark, NO_RESET, Operator, Reason};
 use runtime::record::log::Sections;
 use std::io::BufRead;
 use std::sync::mpsc::{Receiver, channel};
+
+/// The commands of a running rig.
+const HELP: &str = "enable, arm: as the drives ask for it; set PATH = VALUE, …: parameters, judged as at a start; \
+                    mark WORDS: a remark in the log; \
+                    show: parameters that may change, with their values; stop: ends the run";
 
 /// Validates sets of parameters before the cycle receives them.
 ///
@@ -80,8 +87,24 @@ impl Rehearsal {
         Ok(())
     }
 
-    /// Sends a set to the cycle if a start would accept it.
-    fn change(&mut self, operator: &mut Operator, text: &str) -> Result<(), String> {
+    /// The parameters that may change, with their active values.
+    fn shown(&self) -> String {
+        let live = self.judge.live().params.iter().filter(|param| matches!(param.place, Tunable::Live(..)));
+        let lines = live.map(|param| format!("  {} = {}\n", param.path, self.value(param)));
+        lines.collect()
+    }
+
+    /// The active value of a parameter, in its unit.
+    fn value(&self, param: &Param) -> String {
+        match (&param.place, param.boolean) {
+            (Tunable::Live(slot, _), true) => (self.control.get(*slot) != 0.0).to_string(),
+            (Tunable::Live(slot, _), false) => quantity(self.control.get(*slot), &param.unit, 6),
+            (Tunable::Start(_), _) => "read by a start".into(),
+        }
+    }
+
+    /// Sends a set to the cycle if a start would accept it. Returns what has changed, in words.
+    fn change(&mut self, operator: &mut Operator, text: &str) -> Result<String, String> {
         let set = self.judge.read(text)?;
         let all = self.with(text);
         self.judge(&set, &all)?;
@@ -90,9 +113,18 @@ impl Rehearsal {
             Answer::Refused(Reason::Set(objection)) => return Err(self.judge.words(&objection)),
             Answer::Refused(why) => return Err(why.words()),
         }
-        set.values().iter().for_each(|(slot, value)| self.control.set(*slot, *value));
+        let mut said = Vec::new();
+        for (slot, value) in set.values() {
+            let live = self.judge.live().params.iter();
+            let param = live.clone().find(|param| matches!(param.place, Tunable::Live(at, _) if at == *slot)).cloned();
+            let before = param.as_ref().map(|param| self.value(param));
+            self.control.set(*slot, *value);
+            if let (Some(param), Some(before)) = (param, before) {
+                said.push(format!("{} {before} → {}", param.path, self.value(&param)));
+            }
+        }
         self.set = all;
-        Ok(())
+        Ok(said.join(", "))
     }
 }
 
@@ -138,7 +170,7 @@ fn carry_out(mut operator: Operator, mut rehearsal: Option<Rehearsal>, typed: &R
             Line::Asked(asked) => &asked.text,
         };
         let mut wait = |command| match operator.wait(command) {
-            Answer::Taken => Ok(()),
+            Answer::Taken => Ok(String::new()),
             Answer::Refused(why) => Err(why.words()),
         };
         let done = match (text.as_str(), text.strip_prefix("set "), &mut rehearsal) {
@@ -148,18 +180,21 @@ fn carry_out(mut operator: Operator, mut rehearsal: Option<Rehearsal>, typed: &R
                 Mark::new(&text[4..]).and_then(|mark| wait(Command::Mark(mark)))
             }
             ("reset", ..) => Err(NO_RESET.into()),
+            ("help", ..) => Ok(HELP.into()),
+            ("show", _, Some(rehearsal)) => Ok(rehearsal.shown()),
             (_, Some(set), Some(rehearsal)) => rehearsal.change(&mut operator, set),
             (_, Some(_), None) => Err(Reason::Unjudged.words()),
-            (_, None, _) => Err("type enable, arm, set PATH = VALUE, mark WORDS or stop".into()),
+            (_, None, _) => Err("type enable, arm, set PATH = VALUE, mark WORDS, show, help or stop".into()),
         };
         match (&done, &line) {
-            (Ok(()), Line::Typed(text)) if text.starts_with("set ") => terminal.line(&format!("  {text}")),
-            (Ok(()), Line::Typed(_)) => {}
-            (Ok(()), Line::Asked(asked)) => terminal.line(&format!("  panel: {}", asked.text)),
+            (Ok(said), Line::Typed(_)) if said.is_empty() => {}
+            (Ok(said), Line::Typed(_)) => terminal.line(&format!("  {}", said.trim())),
+            (Ok(said), Line::Asked(asked)) if said.is_empty() => terminal.line(&format!("  panel: {}", asked.text)),
+            (Ok(said), Line::Asked(asked)) => terminal.line(&format!("  panel: {} ({})", asked.text, said.trim())),
             (Err(why), _) => terminal.error(&format!("`{text}` is refused: {why}")),
         }
         if let Line::Asked(asked) = line {
-            asked.answer(&done);
+            asked.answer(&done.map(|_| ()));
         }
     }
 }

@@ -7,6 +7,7 @@ use crate::parquet::{self, Holds};
 use crate::terminal::Terminal;
 use crate::{project, quantity};
 use abi::rig::Rig;
+use abi::{Description, Slot};
 use runtime::hil::control::Control;
 use runtime::hil::replay::{Replay, Stopped, What};
 use runtime::hil::trace::{self, Cycle, Passed, Shape};
@@ -29,19 +30,22 @@ pub fn replay(args: &Args, terminal: &mut Terminal) -> End {
     let mut exports = Exports::new(args, &ready.rig, &control);
     let mut replay = Replay::new(&ready.rig, control);
     let (mut stopped, mut marks) = (None, Vec::new());
+    let mut changes: Vec<String> = Vec::new();
     loop {
         let message = match reader.message() {
             Ok(Some(message)) => message,
             Ok(None) => break,
             Err(error) => return fail(terminal, &error.to_string()),
         };
-        exports.add(&message);
         if let (trace::MARK, Some((due_ns, words))) = (message.kind, trace::read_mark(&message.words)) {
             marks.push(format!("  mark at {:.3} s: {words}", due_ns as f64 * 1e-9));
         }
         if stopped.is_none() {
             stopped = replay.message(&message).err();
         }
+        let time = replay.model_time().filter(|_| stopped.is_none());
+        exports.add(&message, time);
+        changes.extend(exports.changes(&message, time, replay.model().description()));
     }
     if let Err(why) = exports.write(args, terminal) {
         return fail(terminal, &why);
@@ -75,6 +79,12 @@ pub fn replay(args: &Args, terminal: &mut Terminal) -> End {
                 quantity::count(found.states)
             ));
             marks.iter().for_each(|mark| terminal.line(mark));
+            for change in changes.iter().take(MOST_CHANGES) {
+                terminal.line(&format!("  {change}"));
+            }
+            if changes.len() > MOST_CHANGES {
+                terminal.line(&format!("  and {} further changes", changes.len() - MOST_CHANGES));
+            }
             if found.skipped + found.lost > 0 {
                 terminal.line(&format!(
                     "  {} messages were lost when it was written; {} cycles could not be computed",
@@ -86,6 +96,9 @@ pub fn replay(args: &Args, terminal: &mut Terminal) -> End {
         }
     }
 }
+
+/// Most changes of parameters that are listed.
+const MOST_CHANGES: usize = 50;
 
 /// Describes a number of a cycle that differs.
 fn differing(rig: &Rig, what: What) -> String {
@@ -117,6 +130,7 @@ impl Exports {
         for (name, holds) in [
             ("k", Holds::Integers),
             ("t [s]", Holds::Numbers),
+            ("model t [s]", Holds::Numbers),
             ("late [s]", Holds::Numbers),
             ("ticks", Holds::Integers),
             ("order", Holds::Words),
@@ -144,12 +158,30 @@ impl Exports {
         Exports { rig: rig.clone(), shape: Shape::of(rig, control), columns, cycles, candump }
     }
 
-    fn add(&mut self, message: &Message) {
+    /// Parameters that a cycle changed, in words. `time`: that of the model, in s.
+    fn changes(&self, message: &Message, time: Option<f64>, model: &Description) -> Vec<String> {
+        let cycle = (message.kind == trace::CYCLE).then(|| Cycle::read(self.shape, &message.words)).flatten();
+        let Some(cycle) = cycle else { return Vec::new() };
+        let when = match time {
+            Some(time) => format!("at {} of the model", quantity::duration(time, 4)),
+            None => format!("in cycle {}, when the model did not run", cycle.k),
+        };
+        let words = |(slot, si): &(Slot, f64)| {
+            let found = model.quantities.iter().find(|quantity| quantity.slot == *slot)?;
+            let value = abi::format::quantity(*si, &found.unit, 6);
+            Some(format!("set {} = {value} {when}", found.path))
+        };
+        cycle.set.iter().filter_map(words).collect()
+    }
+
+    /// Adds a message; `time`: that of the model after it, in s.
+    fn add(&mut self, message: &Message, time: Option<f64>) {
         if let (Some(rows), trace::CYCLE) = (&mut self.cycles, message.kind)
             && let Some(cycle) = Cycle::read(self.shape, &message.words)
         {
             let Cycle { k, due_ns, late_ns, ticks, order, .. } = cycle;
-            let _ = write!(rows, "{k},{:?},{:?},{ticks},{order:?}", due_ns as f64 * 1e-9, f64::from(late_ns) * 1e-9);
+            let (due, late) = (due_ns as f64 * 1e-9, f64::from(late_ns) * 1e-9);
+            let _ = write!(rows, "{k},{due:?},{:?},{late:?},{ticks},{order:?}", time.unwrap_or(f64::NAN));
             for reading in &cycle.readings {
                 let _ = write!(rows, ",{:?},{}", reading.value, reading.age);
             }

@@ -1,6 +1,6 @@
 //! Fault injection: faults of simulated nodes, and the times at which they act.
 //!
-//! In: `load fault 0x2310 at 3 s`, `panel.enable = 0 at 5 s`, `servo encoder frozen when servo.speed > 10 rad/s for 20
+//! In: `load fault 0x2310 at 3 s`, `panel.enable = 0 at 5 s of run`, `servo encoder frozen when servo.speed > 10 rad/s for 20
 //! ms`. Out: a [`Hook`].
 
 use abi::rig::{Kind, Rig, Signal, SignalKind};
@@ -52,8 +52,10 @@ pub enum Effect {
 /// Begin of a fault.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub enum Start {
-    /// At this time, ns.
+    /// At this time since power-on, ns.
     At(u64),
+    /// At this time of the model, ns: after [`SimulatedBench::begin_run`](super::SimulatedBench::begin_run).
+    OfRun(u64),
     /// As soon as a true signal of the shaft (torque, speed, position of a drive, SI) is above or below a level.
     When {
         /// The signal.
@@ -102,7 +104,7 @@ pub const WORDS: &[&str] = &[
 
 /// Parses a fault for a rig. The error names the mistake and the correct form.
 pub fn read(text: &str, rig: &Rig) -> Result<Hook, String> {
-    let form = "it reads as `load fault 0x2310 at 3 s` or `panel.enable = 0 at 5 s`, with `when load.speed > 10 rad/s` \
+    let form = "it reads as `load fault 0x2310 at 3 s` or `panel.enable = 0 at 5 s of run`, with `when load.speed > 10 rad/s` \
                 instead of the time, and `for 20 ms` at its end";
     let wrong = |what: String| format!("`{text}`: {what}; {form}");
     let (rest, lasts) = match text.rsplit_once(" for ") {
@@ -110,7 +112,11 @@ pub fn read(text: &str, rig: &Rig) -> Result<Hook, String> {
         None => (text, None),
     };
     let (what, start) = if let Some((what, time)) = rest.rsplit_once(" at ") {
-        (what, Start::At(nanoseconds(time).map_err(&wrong)?))
+        let start = match time.trim_end().strip_suffix(" of run") {
+            Some(time) => Start::OfRun(nanoseconds(time).map_err(&wrong)?),
+            None => Start::At(nanoseconds(time).map_err(&wrong)?),
+        };
+        (what, start)
     } else if let Some((what, condition)) = rest.rsplit_once(" when ") {
         (what, condition_of(condition, rig).map_err(&wrong)?)
     } else {

@@ -118,7 +118,13 @@ impl Served {
             }
         }
         for text in &doors.inject {
-            bench.hook(fault_injection::read(text, rig).map_err(|why| misused(format!("--inject '{text}': {why}")))?);
+            let hook = fault_injection::read(text, rig).map_err(|why| misused(format!("--inject '{text}': {why}")))?;
+            if matches!(hook.start, fault_injection::Start::OfRun(_)) {
+                return Err(misused(format!(
+                    "--inject '{text}': drives know no time of the model; give one since power-on"
+                )));
+            }
+            bench.hook(hook);
         }
         let world = Simulation::real_time();
         let clock = world.monotonic().expect("this world's time is real");

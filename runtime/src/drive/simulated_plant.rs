@@ -200,6 +200,16 @@ impl SimulatedBench {
         self.hooks.push(Armed { hook, since_ns: None, until_ns: None, over: false });
     }
 
+    /// The model begins to run now: from here on the times of faults count that are times of the model.
+    pub fn begin_run(&mut self) {
+        let now_ns = self.count * self.step_ns;
+        for Armed { hook, .. } in &mut self.hooks {
+            if let Start::OfRun(at) = hook.start {
+                hook.start = Start::At(now_ns + at);
+            }
+        }
+    }
+
     /// True values at a drive.
     pub fn shaft(&self, node: usize) -> Shaft {
         self.shafts[node]
@@ -242,6 +252,7 @@ impl SimulatedBench {
             self.hooks.iter().filter(|armed| !armed.over).map(|armed| match (armed.since_ns, armed.hook.start) {
                 (Some(_), _) => armed.until_ns.unwrap_or(u64::MAX),
                 (None, Start::At(at)) => at,
+                (None, Start::OfRun(_)) => u64::MAX,
                 // A condition is checked after each step.
                 (None, Start::When { .. }) => (self.count + 1) * self.step_ns,
             });
@@ -303,6 +314,7 @@ impl SimulatedBench {
             let begins = !begun
                 && match hook.start {
                     Start::At(start_ns) => start_ns <= now_ns,
+                    Start::OfRun(_) => false,
                     Start::When { signal, above, level } => {
                         let shaft = self.shafts[signal.node];
                         let value = match signal.what {

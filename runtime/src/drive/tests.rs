@@ -6,7 +6,7 @@ use super::*;
 use crate::can::Frame;
 use crate::canopen::object::Entry;
 use crate::canopen::{Access, NmtState, Object, Service, Type};
-use crate::drive::fault_injection::{self, Hook};
+use crate::drive::fault_injection::{self, Hook, Start};
 use crate::testing::drives::*;
 use abi::rig::{Kind, Mode, Rig, SignalKind};
 
@@ -507,6 +507,7 @@ fn hooks_are_parsed_or_refused_with_a_message() {
     let signal = abi::rig::Signal { node: LOAD, what: SignalKind::Speed };
     assert_eq!(hook.start, Start::When { signal, above: true, level: 10.0 });
     assert_eq!(read("load answers late 2 ms at 1 s").unwrap().effect, Effect::AnswersLate(2_000_000));
+    assert_eq!(read("load fault 0x2310 at 3 s of run").unwrap().start, Start::OfRun(3_000_000_000));
     for (text, word) in [
         ("load fault 0x2310", "it doesn't say when"),
         ("load fault 2310 at 1 s", "`2310` is no code such as 0x2310"),

@@ -7,6 +7,7 @@ use super::control::{Control, CycleInputs};
 use super::trace::{self, Cycle, Shape};
 use crate::record::log::{LOST, Message};
 use abi::rig::Rig;
+use abi::{Instance, Slot};
 
 /// Result of a replay.
 #[derive(Clone, PartialEq, Debug, Default)]
@@ -96,6 +97,19 @@ impl<'a> Replay<'a> {
             trace::CYCLE => self.cycle(&message.words),
             _ => Ok(()),
         }
+    }
+
+    /// Time of the model after the last cycle, in s; none before it runs, and where it is not known.
+    pub fn model_time(&self) -> Option<f64> {
+        self.next?;
+        let model = self.control.model();
+        let steps = model.get(Slot::COUNT);
+        (steps > 0.0).then(|| steps * model.get(Slot::STEP))
+    }
+
+    /// The program whose parameters change.
+    pub fn model(&self) -> &Instance {
+        self.control.model()
     }
 
     /// The result so far.

@@ -187,6 +187,13 @@ impl Session {
         self.operator.take()
     }
 
+    /// Runs cycles until the model has run for the first time, or the run has ended.
+    pub fn run_to_model(&mut self) {
+        while self.hil.ended().is_none() && self.hil.counts().cycles == 0 {
+            self.hil.cycle();
+        }
+    }
+
     /// Runs cycles until the run has ended, then leaves real time.
     pub fn run(&mut self) -> End {
         let end = self.hil.ended().cloned().unwrap_or_else(|| self.hil.run());
