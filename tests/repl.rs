@@ -326,6 +326,24 @@ fn text(bytes: &[u8]) -> String {
     String::from_utf8_lossy(bytes).into_owned()
 }
 
+/// A steady curve asks only for what it shows to rest: the path travelled grows on.
+///
+/// Mutant tried by hand: all states must rest (refused).
+#[test]
+fn a_steady_curve_leaves_other_states_in_motion() {
+    let folder = folder("steady");
+    let law = "model Own {\n  input  v [m/s]\n  state  s [mm] = 0\n  state  z = 0\n  ds/dt = abs(v)\n  dz/dt = (1 - z) / 0.1 s\n  output F [N] = z * (1 N + 2 N * exp(-(v / 5 mm/s)^2)) * tanh(v / 1 mm/s)\n  allow creep \"smooth\"\n  allow not-dissipative \"as measured\"\n}\n";
+    fs::write(folder.join("p.fric"), law).unwrap();
+    let curve = |of: &str| {
+        piped(&folder, &["repl", "p.fric"], &format!("f = Own()\nplot {of} against f.v = -20 mm/s .. 20 mm/s steady\n"))
+    };
+    let output = curve("f.F");
+    assert_eq!(output.status.code(), Some(0), "{}", text(&output.stderr));
+    assert!(text(&output.stdout).contains("f.F [N]"), "{}", text(&output.stdout));
+    let refused = text(&curve("f.s").stderr);
+    assert!(refused.contains("`f.s` still moves"), "{refused}");
+}
+
 #[test]
 fn a_script_ends_at_its_first_error_unless_told_otherwise() {
     let folder = folder("script");
@@ -401,6 +419,8 @@ fn the_last_run_can_be_queried_with_any_windows() {
         ("unit F", "N   a force"),
         ("fr.z", "µm"),
         ("max(v)", "m/s"),
+        ("max(v) after 2 s", "m/s"),
+        ("max(v after 2 s) * 2 - min(v)", "m/s"),
         ("explain F", "F: output [N]"),
         ("explain fr.z", "fr.z: state [µm]"),
         ("explain fr", "fr.sigma0"),

@@ -95,7 +95,7 @@ enum Next {
 }
 
 /// Commands of the shell that the prompt does not have.
-const COMMAND_LINE: [&str; 14] = [
+const COMMAND_LINE: [&str; 16] = [
     "linearise",
     "linearize",
     "sweep",
@@ -110,6 +110,8 @@ const COMMAND_LINE: [&str; 14] = [
     "bench",
     "new",
     "deploy",
+    "fit",
+    "panel",
 ];
 
 /// Executes lines.
@@ -196,6 +198,11 @@ impl Prompt<'_> {
         if matches!(first, "for" | "while") && second.is_some() {
             let help = "several values are a `sweep` in an experiment, a curve is `plot f.F against f.v = 0 .. 1 m/s`";
             return Some(format!("there are no loops; {help}"));
+        }
+        // `sweep` is both: as a statement it has a `=`.
+        let is_statement = matches!(first, "record" | "data") || first == "sweep" && text.contains('=');
+        if second.is_some() && is_statement {
+            return Some(format!("`{first}` stands in an experiment of a file: `use FILE`, then `run NAME`"));
         }
         if second.is_some() && COMMAND_LINE.contains(&first) {
             return Some(format!(

@@ -52,7 +52,21 @@ impl std::error::Error for Restless {}
 /// # Errors
 /// The state that moves most if there is no equilibrium, or why a run stopped.
 pub fn settle(instance: Instance, tol: f64, watch: &mut dyn FnMut(f64) -> Continue) -> Result<Instance, Restless> {
+    settle_of(instance, &[], tol, watch)
+}
+
+/// As [`settle`], but until these quantities rest, if there are any: other states, such as a path travelled, may move on.
+///
+/// # Errors
+/// As [`settle`].
+pub fn settle_of(
+    instance: Instance,
+    of: &[Slot],
+    tol: f64,
+    watch: &mut dyn FnMut(f64) -> Continue,
+) -> Result<Instance, Restless> {
     let mut now = instance;
+    let mut seen: Option<Vec<f64>> = None;
     if moving(&mut now, 1.0).is_none() {
         return Ok(now);
     }
@@ -88,6 +102,13 @@ pub fn settle(instance: Instance, tol: f64, watch: &mut dyn FnMut(f64) -> Contin
         if moved.is_none() {
             return Ok(now);
         }
+        now.call(Function::Outputs);
+        let values: Vec<f64> = of.iter().map(|slot| now.get(*slot)).collect();
+        let rests = |(a, b): (&f64, &f64)| (a - b).abs() <= REST * a.abs().max(b.abs());
+        if !of.is_empty() && seen.as_ref().is_some_and(|seen| seen.iter().zip(&values).all(rests)) {
+            return Ok(now);
+        }
+        seen = Some(values);
     }
     Err(moved.expect("there is at least one wait"))
 }

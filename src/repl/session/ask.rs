@@ -18,7 +18,8 @@ impl Session {
         let text = self.with_values(text)?;
         let what = self.meant(&text).unwrap_or(Subject::Session);
         let case = match self.now(&what, &[format!("plot {text}")], &text) {
-            Err(Fault::Found(files, errors)) if errors.iter().any(|error| error.code == "E0901") => {
+            // A measure, or its window, which lies outside of the second that a query takes.
+            Err(Fault::Found(files, errors)) if errors.iter().any(|error| matches!(error.code, "E0901" | "E0902")) => {
                 return self.measured(&what, &text).unwrap_or(Err(Fault::Found(files, unplotted(errors))));
             }
             Err(Fault::Found(files, errors)) => return Err(Fault::Found(unplot(files, &text), unplotted(errors))),

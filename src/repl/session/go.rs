@@ -336,7 +336,8 @@ impl Session {
             let mut instance = fitted.instance;
             if steady {
                 instance.start(0.0);
-                instance = equilibrium::settle(instance, STEADY_TOL, watch).map_err(|why| match why {
+                let shown: Vec<Slot> = series.iter().map(|series| series.slot).collect();
+                instance = equilibrium::settle_of(instance, &shown, STEADY_TOL, watch).map_err(|why| match why {
                     equilibrium::Restless::Failed(failure) => Fault::Stopped(Box::new(failure)),
                     equilibrium::Restless::Moves { .. } => Fault::Words(format!(
                         "at {path} = {} it {why}; leave `steady` out",
