@@ -51,7 +51,15 @@ pub fn parse(text: &str) -> Result<Vary, String> {
     Ok(Vary { path: path.into(), unit, how })
 }
 
+/// Names of the distributions.
+const DISTRIBUTIONS: [&str; 3] = ["normal", "lognormal", "uniform"];
+
 fn listed(text: &str, examples: &str) -> Result<(Unit, How), String> {
+    if let Some(name) =
+        DISTRIBUTIONS.iter().find(|name| text.strip_prefix(**name).is_some_and(|rest| rest.starts_with('(')))
+    {
+        return Err(format!("a distribution follows `~`, and values follow `=`: write `~ {name}(…)`"));
+    }
     let Some((first, rest)) = text.split_once("..") else {
         let (values, unit) = of_one_kind(&text.split(',').collect::<Vec<_>>())?;
         return Ok((unit, How::Values(values)));
@@ -95,7 +103,7 @@ fn drawn(text: &str, examples: &str) -> Result<(Unit, How), String> {
     let inside = rest.trim_end().strip_suffix(')').ok_or(examples)?;
     let parts: Vec<&str> = inside.split(',').collect();
     let &[first, second] = parts.as_slice() else { return Err(examples.into()) };
-    let pair = || of_one_kind(&[first, second]);
+    let pair = || of_one_kind(&[first, second]).map_err(|why| format!("{why}; {}", usage(name.trim(), first, second)));
     match name.trim() {
         "normal" => match pair()? {
             (values, unit) if values[1] >= 0.0 => Ok((unit, How::Normal(values[0], values[1]))),
@@ -117,6 +125,23 @@ fn drawn(text: &str, examples: &str) -> Result<(Unit, How), String> {
         }
         other => Err(format!("`{other}` is not a known distribution: normal, lognormal, uniform")),
     }
+}
+
+/// How a distribution is written; with its numbers, if its second one is a share of the first.
+fn usage(name: &str, first: &str, second: &str) -> String {
+    let form = if name == "uniform" { "uniform(from, to)" } else { "normal(mean, standard deviation)" };
+    let (Ok((middle, unit)), Ok((share, percent))) = (quantity::parse(first), quantity::parse(second)) else {
+        return form.into();
+    };
+    if percent.text != "%" {
+        return form.into();
+    }
+    let shown = |si: f64| format!("{} {unit}", quantity::significant(unit.from_si(si), 6));
+    let pair = match name {
+        "uniform" => [middle * (1.0 - share), middle * (1.0 + share)],
+        _ => [middle, middle * share],
+    };
+    format!("{form}: write `{name}({}, {})`", shown(pair[0]), shown(pair[1]))
 }
 
 /// Values of one dimension; the unit is that of the first.

@@ -229,7 +229,7 @@ impl<'t> Reader<'t> {
             // An error at each use of the name; reported once.
             Some(mistake @ (WordMistake::ForeignName | WordMistake::Reserved)) => seen.insert((mistake, word(d))),
             // A keyword as a name is reported at its declaration, not at its uses.
-            Some(WordMistake::Misfit) => !reserved.contains(word(d)),
+            Some(WordMistake::Misfit) => !blocks && !reserved.contains(word(d)),
             // A choice or a loop of another language has several statements; it is reported once, and its end with it.
             Some(WordMistake::Block) => !std::mem::replace(&mut blocks, true),
             Some(WordMistake::BlockEnd) => !blocks,
@@ -396,6 +396,13 @@ impl<'t> Reader<'t> {
                 }),
             _ => {
                 let mut diagnostic = slips::explain(&self.source, piece, &stop);
+                let next = self.source.word(first + 1);
+                if diagnostic.help.is_none() && matches!(next, "=" | ".") {
+                    self.lost.push(word.to_string());
+                    diagnostic = diagnostic.help(
+                        "a parameter stands in its model: `model M { param m = 2 kg }`; for the whole file write `const m = 2 kg`",
+                    );
+                }
                 if diagnostic.help.is_none() {
                     diagnostic = diagnostic.help(
                         "a file has items: import, const, fn, table, interface, model, experiment, fit, device, rig",
@@ -429,7 +436,7 @@ impl<'t> Reader<'t> {
                 let at = self.source.span(piece.end - 1);
                 self.report(
                     Diagnostic::error("E0001", "expected `{` here")
-                        .label(at, "behind this")
+                        .label(at, "after this")
                         .help(format!("write `{} {{ ... }}`", self.source.text[span.range()].trim_end())),
                 );
             }
@@ -599,7 +606,7 @@ impl<'t> Reader<'t> {
                 let head = self.read(Rule::one_stmt, piece);
                 if head.is_some() && self.source.word(piece.start) != "go" {
                     let span = self.source.span(piece.end - 1);
-                    self.report(Diagnostic::error("E0001", "expected `{` here").label(span, "behind this"));
+                    self.report(Diagnostic::error("E0001", "expected `{` here").label(span, "after this"));
                 }
                 (head, None)
             }
@@ -746,7 +753,7 @@ impl<'t> Reader<'t> {
         let pieces = self.source.statements(Place::Resets, block);
         if pieces.is_empty() {
             let brace = self.source.span(block.start - 1);
-            self.report(Diagnostic::error("E0001", "expected `reset(...) = ...` here").label(brace, "behind this"));
+            self.report(Diagnostic::error("E0001", "expected `reset(...) = ...` here").label(brace, "after this"));
         }
         let mut resets = Vec::new();
         for piece in pieces {
@@ -919,7 +926,7 @@ impl<'t> Reader<'t> {
             Rule::part => RigStatement::Part(self.part(pair, piece)),
             Rule::hardware_head => {
                 let end = self.source.span(piece.end - 1);
-                self.report(Diagnostic::error("E0001", "expected `{` here").label(end, "behind this"));
+                self.report(Diagnostic::error("E0001", "expected `{` here").label(end, "after this"));
                 return None;
             }
             Rule::wire => RigStatement::Wire(self.wire(pair)),

@@ -18,6 +18,7 @@ pub(crate) struct Stop {
 /// The diagnostic for an unreadable piece.
 pub(crate) fn explain(source: &Source, piece: Piece, stop: &Stop) -> Diagnostic {
     let finders = [
+        foreign_statement,
         borrowed,
         unit_in_parentheses,
         character,
@@ -170,13 +171,20 @@ fn character(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
                 .help(format!("write `d{}/dt`", source.word(at - 1))),
         );
     }
+    if found == '\'' && at > piece.start && source.glued(at) && matches!(source.word(at - 1), ")" | "]") {
+        return Some(
+            Diagnostic::error("E0001", "there are no arrays: nothing to transpose")
+                .label(source.span(at), "")
+                .help("leave `'` out; several equal parts are `part el[i in 1 .. 4] = Model(k = i)`"),
+        );
+    }
     let instead = match found {
         '−' | '–' | '—' => "write `-`",
         '×' | '⋅' | '∙' | '•' => "write `*`; between units `·`",
         '·' => "between values write `*`; in a unit `·` has no blank around it",
         '÷' => "write `/`",
         '²' => "write `^2`",
-        '⁻' | '¹' => "powers are written `^2`, and what is divided by stands behind `/`: `m/s^2`",
+        '⁻' | '¹' => "powers are written `^2`, and what is divided by stands after `/`: `m/s^2`",
         '³' => "write `^3`",
         '≤' => "write `<=`",
         '≥' => "write `>=`",
@@ -402,6 +410,108 @@ fn operator(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
     Some(Diagnostic::error("E0001", format!("`{here}` does not fit here")).label(source.span(at), "").help(instead))
 }
 
+/// Statements of MATLAB, Python and Modelica that have no counterpart under their name: words that begin one, what is
+/// said about it, and what to write.
+const FOREIGN: &[(&[&str], &str, &str)] = &[
+    (
+        &["while", "for", "foreach", "loop", "repeat", "do"],
+        "there are no loops",
+        "every equation holds at every instant; for several equal parts write\n`part el[i in 1 .. 4] = Model(k = i)` and `sum(el.f)`, for several runs `sweep`",
+    ),
+    (
+        &["switch", "case", "otherwise"],
+        "a choice is a value, not a statement: every equation holds at all times",
+        "write `F = if v > 0 m/s then a else if v < 0 m/s then b else c`; regimes with a memory are `mode`s",
+    ),
+    (
+        &["persistent", "global", "static"],
+        "what keeps its value is a state",
+        "in sampled code write `state y1 [m] = 0`, and `next(y1) = y` in `every Ts { … }`; what never changes is a `param` of a model, or for the whole file `const g = 9.81 m/s^2`",
+    ),
+    (
+        &["disp", "fprintf", "printf", "print", "display", "sprintf"],
+        "an experiment says what it shows by `show`",
+        "write `show max(F)`; its value is printed after the run",
+    ),
+    (
+        &[
+            "subplot",
+            "figure",
+            "axis",
+            "xlim",
+            "ylim",
+            "grid",
+            "legend",
+            "xlabel",
+            "ylabel",
+            "title",
+            "hold",
+            "semilogx",
+            "semilogy",
+            "loglog",
+            "tiledlayout",
+            "nexttile",
+            "yyaxis",
+            "saveas",
+            "exportgraphics",
+        ],
+        "how a figure looks is said by `plot`",
+        "write `plot F [N] as \"friction\" in 0 N .. 2 N against v log after 1 s title \"…\"`, and a `plot` for each panel;\nsize, columns and file are options: `fric run FILE --plot fig.pdf --size 85x60mm --columns 2`",
+    ),
+    (
+        &["clear", "clc", "close", "clearvars", "format", "warning", "addpath", "tic", "toc", "rng", "pause", "more"],
+        "nothing has to be prepared: each run starts anew",
+        "leave the line out",
+    ),
+];
+
+/// Reports statements that begin with a word of another language.
+fn foreign_statement(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
+    let first = piece.start;
+    if first >= piece.end || source.kind(first) != Some(TokenKind::Word) || stop.at > first + 1 {
+        return None;
+    }
+    let (word, next) = (source.word(first), source.word(first + 1));
+    if matches!(next, "=" | "." | "/" | "[") {
+        return None;
+    }
+    let error = |message: &str, to: usize| {
+        Diagnostic::error("E0001", message).label(source.span(first).to(source.span(to)), "")
+    };
+    // `function F = coulomb(v)`
+    if word == "function" && source.is_symbol(first + 2, "=") && source.is_symbol(first + 4, "(") {
+        let close = (first + 4..source.marks.len()).find(|&mark| source.is_symbol(mark, ")"))?;
+        let args: Vec<&str> = (first + 5..close).map(|mark| source.word(mark)).filter(|word| *word != ",").collect();
+        let args: Vec<String> = args.iter().map(|arg| format!("{arg} [m/s]")).collect();
+        let help = format!(
+            "write `fn {}({}) [N] = …`, with the units of arguments and result; what has states is a `model`",
+            source.word(first + 3),
+            args.join(", ")
+        );
+        return Some(error("a function is one expression, without a body", close).help(help));
+    }
+    // `assert(max(F) < 2)`
+    if word == "assert" && next == "(" {
+        let help = "in an experiment write `expect max(F) < 2 N`, in a model `require Fs >= Fc, \"why\"`";
+        return Some(error("what must hold is an `expect`", first).help(help));
+    }
+    // `parameter Real k = 2`
+    if matches!(next, "Real" | "Integer" | "Boolean") && source.kind(first + 2) == Some(TokenKind::Word) {
+        let name = source.word(first + 2);
+        let help = match word {
+            "parameter" | "constant" => format!("write `param {name} = 2 N/m`: its unit is that of its value"),
+            "input" | "output" => format!("write `{word} {name} [m/s]`, with its unit"),
+            _ => return None,
+        };
+        return Some(error("a quantity has a unit, and no type", first + 1).help(help));
+    }
+    let (_, message, help) = FOREIGN.iter().find(|(words, ..)| words.contains(&word))?;
+    let block =
+        matches!(word, "while" | "for" | "foreach" | "loop" | "repeat" | "do" | "switch" | "case" | "otherwise");
+    let error = error(message, first).help(*help);
+    Some(if block { error.about_word(WordMistake::Block) } else { error })
+}
+
 /// Reports whole constructs of MATLAB, Python and Modelica, for which there is another way here. The list with more of
 /// them is in docs/from-matlab.md.
 fn borrowed(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
@@ -424,6 +534,28 @@ fn borrowed(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
     {
         let sign = source.word(dot + 1);
         return error("there are no arrays: each name is one number", dot, dot + 1, format!("write `{sign}`"));
+    }
+    // `...` at the end of a line
+    if let Some(dots) = [Some(at), at.checked_sub(1)]
+        .into_iter()
+        .flatten()
+        .find(|&at| at + 1 < source.marks.len() && source.word(at) == ".." && source.word(at + 1).starts_with('.'))
+    {
+        let message = "a statement goes on in the next line by itself";
+        return error(message, dots, dots + 1, "leave `...` out: line breaks have no meaning".into());
+    }
+    // `tf([1], [0.1 1])`
+    const TRANSFERS: [&str; 5] = ["tf", "ss", "zpk", "pid", "c2d"];
+    if let Some(call) = (first..piece.end.min(at + 1))
+        .find(|&mark| TRANSFERS.contains(&source.word(mark)) && source.is_symbol(mark + 1, "("))
+    {
+        let help = "1/(T s + 1) is `state y [m] = 0` and `dy/dt = (u - y) / T`; `LowPass` and `Notch` of `std.signal` and `PID` of\n`std.control` are parts: `part f = LowPass(u = x, f = 10 Hz)`";
+        return error("a transfer function is written as equations", call, call, help.into());
+    }
+    // `1:1:10`
+    if begin == "sweep" && source.word(at) == ":" {
+        let help = "write `1 mm .. 10 mm by 1 mm`, with the unit at each number; `lin 5` and `log 5` give five values";
+        return error("a range of values is written with `..`", at, at, help.into());
     }
     // `g = @(v) Fc * sign(v)`
     let at_sign = (first..piece.end.min(at + 2)).find(|&mark| source.word(mark) == "@");
@@ -474,6 +606,10 @@ fn borrowed(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
         && (open + 1..close).filter(|&mark| source.kind(mark) == Some(TokenKind::Number)).count() > 1;
     let declared = word(first) && matches!(begin, "part" | "input" | "output") && open == first + 2;
     if numbers && !declared && at <= close + 1 {
+        if begin == "table" {
+            let help = "write each point as `x: y`: `= linear { 0 m/s: 1 N, 1 m/s: 2 N }`, or name a file: `= linear \"curve.csv\"`";
+            return error("points of a table stand in braces", open, close, help.into());
+        }
         let help = "several equal parts are `part el[i in 1 .. 3] = Model(k = i * 1 N/m)`, points of a curve a `table`,\nand the values of a sweep `sweep k = 1 N/m, 2 N/m`";
         return error("there are no arrays: each name is one number", open, close, help.into());
     }
@@ -499,13 +635,13 @@ fn habit(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
     }
     if declares && at == first + 2 && here == ":" {
         let help = format!("write `{begin} {before} = ...`, or a unit: `{begin} {before} [m]`");
-        return Some(error("a value stands behind `=`", at, at).help(help));
+        return Some(error("a value stands after `=`", at, at).help(help));
     }
     if declares && at == first + 1 && here == "[" {
         let close = (at..piece.end).find(|&mark| source.is_symbol(mark, "]"))?;
         let name = if word(close + 1) { source.word(close + 1) } else { "name" };
         let help = format!("write `{begin} {name} {}`", slice(source, at, close));
-        return Some(error("the unit stands behind the name", at, close).help(help));
+        return Some(error("the unit stands after the name", at, close).help(help));
     }
     if let Some(at) = [at - 1, at].into_iter().find(|&at| matches!(source.word(at), "elseif" | "elif" | "elsif")) {
         let message = format!("`{}` is two words", source.word(at));
@@ -528,6 +664,15 @@ fn habit(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
         return Some(
             error("several parts have an index", at - 1, last).help(format!("write `{name}[i in 1 .. {here}]`")),
         );
+    }
+    // An argument without its name: `LuGre(10 mm/s)`.
+    let value = matches!(source.kind(at), Some(TokenKind::Number)) || here == "-";
+    if value && matches!(before, "(" | ",") && stop.expected.iter().any(|expected| expected == "a name") {
+        let open = (first..at).rev().find(|&mark| source.is_symbol(mark, "(")).filter(|&mark| mark > first);
+        let model = open.map_or("Model", |open| source.word(open - 1));
+        let given = operand_at(source, at);
+        let help = format!("write `NAME = {given}` with the name of an input or param; `fric doc {model}` lists them");
+        return Some(error("an argument has a name", at, at).help(help));
     }
     // An argument without its name: `LuGre(v)`.
     let named = stop.expected.iter().any(|expected| expected == "`=`");
@@ -557,11 +702,15 @@ fn missing(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
         "part" if expects("`(`") && source.kind(last) == Some(TokenKind::Word) => {
             ("`(`", format!("write `{}()`, with arguments in the brackets", source.word(last)))
         }
+        "plot" if source.is_word(last, "against") => {
+            let help = "in a file write `sweep v = 1 mm/s .. 20 mm/s lin 40` and `plot final(F) against v`; a range after `against` is for the prompt";
+            ("a quantity", help.to_string())
+        }
         "sweep" if expects("`by`") => ("`by`", "add how far apart the values are: `by ...`".to_string()),
         _ => return None,
     };
     let message = format!("expected {wanted} here");
-    Some(Diagnostic::error("E0001", message).label(source.span(last), "behind this").help(help))
+    Some(Diagnostic::error("E0001", message).label(source.span(last), "after this").help(help))
 }
 
 /// Reports a unit with blanks: `2 N m`, `[N m]`.
@@ -697,7 +846,7 @@ fn branch(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
     let end = source.span(stop.at.max(piece.start + 1) - 1);
     Some(
         Diagnostic::error("E0001", message)
-            .label(source.span(condition).to(end), format!("`{missing}` is missing behind this"))
+            .label(source.span(condition).to(end), format!("`{missing}` is missing after this"))
             .help(help),
     )
 }
@@ -868,7 +1017,7 @@ fn plain(source: &Source, piece: Piece, stop: &Stop) -> Diagnostic {
     if stop.at >= piece.end {
         let message =
             if wanted.is_empty() { "something is missing here".to_string() } else { format!("{wanted} here") };
-        return Diagnostic::error("E0001", message).label(source.span(piece.end - 1), "behind this");
+        return Diagnostic::error("E0001", message).label(source.span(piece.end - 1), "after this");
     }
     let found = source.word(stop.at);
     let shown: String = found.chars().take(30).collect();

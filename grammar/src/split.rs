@@ -302,10 +302,20 @@ impl<'t> Source<'t> {
         }
         let guilty = guilty.or(open.last().copied()).unwrap_or(from);
         let last = self.marks[self.blocks[guilty].0 - 1].line + 1;
+        let end = self.blocks[guilty].0 - 1;
+        if self.is_word(end, "end") && self.marks[end].first_on_line {
+            self.complaints.push(
+                Diagnostic::error("E0002", "a block ends with `}`")
+                    .label(self.span(end), "ends nothing")
+                    .label(self.span(guilty), "the block begins here")
+                    .help("write `}` in place of `end`"),
+            );
+            return;
+        }
         self.complaints.push(
             Diagnostic::error("E0002", "this `{` is not closed")
                 .label(self.span(guilty), "no `}` belongs to it")
-                .help(format!("add `}}` behind line {last}")),
+                .help(format!("add `}}` after line {last}")),
         );
     }
 

@@ -153,7 +153,15 @@ fn ranges(system: &System, types: &Types, files: &Files, diagnostics: &mut Vec<D
         if let Some(range) = var.range_span {
             error = error.label(range, format!("allowed: {}", files.slice(range)));
         }
-        diagnostics.push(error.help(format!("give a value that is {word} {bound}")));
+        let percent = unit.dimension.is_none()
+            && unit.scale == 1.0
+            && high.is_some_and(|(high, _)| high == 1.0)
+            && value > 1.0
+            && value <= 100.0;
+        diagnostics.push(error.help(match percent {
+            true => format!("give a value that is {word} {bound}, such as `{} %`", three_digits(value)),
+            false => format!("give a value that is {word} {bound}"),
+        }));
     }
 }
 

@@ -8,6 +8,7 @@ use abi::plan::{self, Formula, MeasureKind};
 use abi::unit::Unit;
 use grammar::ast::{self, BinaryOp, Expr};
 use grammar::diagnostic::Diagnostic;
+use grammar::span::Span;
 use std::sync::Arc;
 
 /// Indices of an expectation's expressions among the observed ones.
@@ -192,6 +193,13 @@ impl Reader<'_> {
             let value = self.constant(id);
             if !value.is_nan() {
                 return Some(Formula::Number(value));
+            }
+            // A chain of comparisons, for example, has been reported.
+            let span = self.system.span(id);
+            let meets = |other: Span| other.file == span.file && other.start < span.end && span.start < other.end;
+            let mut reported = self.loaded.diagnostics.iter().filter(|d| d.is_error()).flat_map(|d| &d.labels);
+            if reported.any(|label| meets(label.span)) {
+                return None;
             }
             let text = one_line(self.loaded.files.slice(self.system.span(id)));
             let error = Diagnostic::error("E0901", format!("`{text}` changes during the run: which value is meant?"))

@@ -791,7 +791,11 @@ impl Reader<'_> {
             if method.is_none() {
                 let error = Diagnostic::error("E0201", format!("there is no solver `{}`", solver.method.text))
                     .label(solver.method.span, "not known");
-                self.diagnostics.push(error.help(format!("solvers are {}", Method::list(Method::ALL))));
+                let all = Method::list(Method::ALL);
+                self.diagnostics.push(error.help(match solver.method.text.starts_with("ode") {
+                    true => format!("`solver adaptive` chooses its steps, also for stiff models, and is the default; solvers are {all}"),
+                    false => format!("solvers are {all}"),
+                }));
             }
             method
         });

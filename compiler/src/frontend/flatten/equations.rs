@@ -231,7 +231,7 @@ impl<'a> Flattener<'a> {
                 return None;
             }
             None => {
-                self.unknown(id, name);
+                self.unknown_target(id, name);
                 return None;
             }
         };

@@ -15,14 +15,58 @@ fn kind_with_article(kind: DeclarationKind) -> String {
     format!("{} {word}", if word.starts_with(['i', 'o']) { "an" } else { "a" })
 }
 
+/// The state whose derivative a name such as `vdot` or `v_dot` of other languages means.
+fn dotted(name: &str) -> Option<&str> {
+    ["_dot", "dot", "_d", "Dot"].iter().find_map(|ending| name.strip_suffix(ending)).filter(|state| !state.is_empty())
+}
+
 /// Limit on the quantities of a model that a message lists.
 const MOST_LISTED: usize = 12;
 
 impl<'a> Flattener<'a> {
+    /// E0204 for the left side of an equation: a derivative in the notation of another language, or a quantity that is
+    /// not declared, which is reported once for all its equations and uses.
+    pub(super) fn unknown_target(&mut self, id: InstanceId, name: &Name) {
+        let derivative = dotted(&name.text).and_then(|state| Some((state, self.var_named(id, state)?)));
+        if let Some((state, var)) = derivative {
+            // It lacks its equation for the same reason.
+            self.refused.push(var);
+            let model = &self.tree(id).model.name.text;
+            let error = Diagnostic::error("E0204", format!("there is no `{}` in {model}", name.text));
+            let error = error.label(name.span, "not declared");
+            self.report(error.help(format!("the derivative of `{state}` is written `d{state}/dt`")));
+            return;
+        }
+        let tree = self.tree(id);
+        let (model, file) = (tree.model, tree.file);
+        let near = nearest(&name.text, declarations(model).map(|declared| declared.name.text.as_str())).is_some();
+        if near || name.span.file != file || self.explained(name, file) || self.system.strangers.contains(&id) {
+            return self.unknown(id, name);
+        }
+        let key = (id, name.text.clone());
+        if !self.undeclared.contains(&key) {
+            self.undeclared.push(key);
+            let error = Diagnostic::error("E0204", format!("there is no `{}` in {}", name.text, model.name.text));
+            let error = error.label(name.span, "not declared");
+            self.report(error.help(format!("write `let {} = …`, or `output` if others read it", name.text)));
+        }
+    }
+
     /// E0204: an unknown name.
     pub(super) fn unknown(&mut self, id: InstanceId, name: &Name) {
         let tree = self.tree(id);
         let model = tree.model;
+        // Its equation lacks the declaration, and is reported.
+        let is_defined = model.body.iter().any(|statement| match statement {
+            Statement::Equation(ast::Equation { target: Target::Name(target), .. }) => {
+                target.text == name.text && target.span != name.span
+            }
+            _ => false,
+        });
+        let near = || nearest(&name.text, declarations(model).map(|declared| declared.name.text.as_str())).is_some();
+        if is_defined && name.span.file == tree.file && !near() {
+            return;
+        }
         if self.explained(name, tree.file) || self.system.strangers.contains(&id) {
             return;
         }
@@ -53,8 +97,18 @@ impl<'a> Flattener<'a> {
                 let more = known.len().saturating_sub(MOST_LISTED);
                 known.truncate(MOST_LISTED);
                 let more = if more > 0 { format!(" and {more} more") } else { String::new() };
-                error.help(format!("{} has {}{more}", model.name.text, known.join(", ")))
+                match known.is_empty() {
+                    true => error.help(format!("nothing of this name is known here; quantities of a part are `part.{}`", name.text)),
+                    false => error.help(format!("{} has {}{more}", model.name.text, known.join(", "))),
+                }
             }
+            None if dotted(&name.text).is_some_and(|state| declarations(model).any(|d| d.name.text == state)) => {
+                let state = dotted(&name.text).unwrap_or_default();
+                error.help(format!("the derivative of `{state}` is written `d{state}/dt`"))
+            }
+            None if name.text == "s" => error.help(
+                "a unit stands right after its number: `2 N/s`; a transfer function is written as equations, `dy/dt = (u - y) / T`;\nfor a quantity of this name declare it, `param s = …`",
+            ),
             None if Unit::parse(&name.text).is_ok() => error.help(format!(
                 "a unit stands right after its number, without parentheses: `2 N/{0}`; for a quantity of this name declare it, `param {0} = …`",
                 name.text
@@ -562,6 +616,9 @@ impl<'a> Flattener<'a> {
             }
             Lookup::Missing => {}
         }
+        if self.indexed(function, args, env) {
+            return self.error(span);
+        }
         let values: Vec<ExprId> = args.iter().map(|arg| self.expr(arg, env)).collect();
         match Builtin::named(&function.text) {
             Some(builtin) if builtin.signature().arguments.len() == values.len() => self.builtin(builtin, values, span),
@@ -573,7 +630,10 @@ impl<'a> Flattener<'a> {
                 let error =
                     Diagnostic::error("E0901", format!("`{}` is a measure: it belongs in `expect`", function.text))
                         .label(function.span, "needs the whole course of a quantity")
-                        .help(format!("write `expect {}(…) < …` in an experiment", function.text));
+                        .help(match function.text.as_str() {
+                            "integral" => "as a quantity it is a state: `state i [m] = 0` and `di/dt = …`;\nover a whole run `show integral(…)` in an experiment".into(),
+                            name => format!("write `expect {name}(…) < …` in an experiment"),
+                        });
                 self.report(error);
                 self.error(span)
             }
@@ -605,7 +665,37 @@ impl<'a> Flattener<'a> {
         let error =
             Diagnostic::error("E0207", format!("`{}` takes {wanted} argument{plural}, not {got}", function.text))
                 .label(function.span, format!("{got} given"));
-        self.report(error);
+        let builtin = Builtin::named(&function.text).map(|builtin| builtin.signature());
+        self.report(match builtin.filter(|signature| signature.arguments.len() == wanted) {
+            Some(signature) => error.help(format!("write `{signature}`: {}", signature.doc)),
+            None => error,
+        });
+    }
+
+    /// Reports `x(1)` and `y(k-1)`, where the name is a quantity and no function.
+    fn indexed(&mut self, function: &Name, args: &[Expr], env: &Env) -> bool {
+        let is_quantity = env
+            .instance
+            .is_some_and(|id| matches!(self.tree(id).names.get(function.text.as_str()), Some(Binding::Var(_))));
+        let [arg] = args else { return false };
+        if !is_quantity || Builtin::named(&function.text).is_some() || MeasureName::named(&function.text).is_some() {
+            return false;
+        }
+        let (name, index) = (&function.text, self.loaded.files.slice(arg.span).replace(' ', ""));
+        let counter = |letter: &char| matches!(letter, 'k' | 'n' | 'i' | 't');
+        let earlier = index.starts_with(|c: char| counter(&c)) && index.contains('-');
+        let help = if earlier {
+            format!(
+                "the value of a tick before is a state: `state {name}1 [m] = 0`, and `next({name}1) = {name}` in the `every` block;\n`delay({name}, 5 ms)` reaches back in continuous time"
+            )
+        } else if index.parse::<f64>().is_ok() || index.starts_with(|c: char| counter(&c)) {
+            format!("each name is one number: write `{name}`; the value at a time is a measure, `at({name}, 1 s)`")
+        } else {
+            format!("to multiply write `{name} * ({})`", self.loaded.files.slice(arg.span))
+        };
+        let error = Diagnostic::error("E0204", format!("`{name}` is a quantity, not a function"));
+        self.report(error.label(function.span.to(arg.span), "reads as a call").help(help));
+        true
     }
 
     pub(super) fn unknown_function(&mut self, function: &Name, env: &Env) {
@@ -641,10 +731,16 @@ impl<'a> Flattener<'a> {
             "interp1" | "interp" | "lookup" | "lut" => {
                 Some("a curve of points is a `table F(v [m/s]) [N] = linear { 0 m/s: 1 N, 1 m/s: 2 N }`".into())
             }
+            "linspace" | "logspace" | "colon" => {
+                Some("values of a sweep: `sweep v = 1 mm/s .. 10 mm/s lin 5`, or `log 5`; points of a curve: `table`".into())
+            }
             "overshoot" => Some("write `max(x) / final(x) - 1`, a measure of an experiment".into()),
             "risetime" | "rise_time" => Some("write `first(x > 0.9 m) - first(x > 0.1 m)`, a measure of an experiment".into()),
             "settlingtime" | "settling_time" | "stepinfo" => {
                 Some("write `settling(x, 1 mm)`, a measure of an experiment".into())
+            }
+            "uniform" | "normal" | "gauss" | "lognormal" => {
+                Some("a distribution is drawn by `fric sweep FILE EXPERIMENT --vary 'k ~ uniform(1 N/m, 2 N/m)'`; a random signal is `noise(1 N, 1 ms, 1)`".into())
             }
             "rand" | "randn" | "random" => Some("write `noise(1 N, 1 ms, 1)`: amplitude, hold time, seed".into()),
             name => nearest(name, known).map(|near| format!("did you mean `{near}`?")),

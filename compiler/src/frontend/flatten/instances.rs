@@ -33,6 +33,9 @@ impl<'a> Found<'a> {
     }
 }
 
+/// Most arguments of a model that a message lists beside a suggestion.
+const MOST_TAKEN: usize = 12;
+
 impl<'a> Flattener<'a> {
     /// Instantiates the root as written in the text. `alone`: its inputs may stay open.
     pub(super) fn written(
@@ -713,6 +716,10 @@ impl<'a> Flattener<'a> {
             };
             let (values, states) = (given(false), given(true));
             error = match (nearest(arg.name, values.iter().chain(&states).copied()), &*values, &*states) {
+                // A short name is near to many: all arguments are listed.
+                (Some(near), [_, _, ..], _) if values.len() <= MOST_TAKEN && arg.name.len() <= 3 => {
+                    error.help(format!("did you mean `{near}`? {owner} takes {}", values.join(", ")))
+                }
                 (Some(near), ..) => error.help(format!("did you mean `{near}`?")),
                 (None, [], []) => error.help(format!("{owner} takes no arguments")),
                 (None, _, []) => error.help(format!("{owner} takes {}", values.join(", "))),

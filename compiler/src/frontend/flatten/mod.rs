@@ -261,6 +261,8 @@ struct Flattener<'a> {
     refused_parts: Vec<Span>,
     /// Quantities with refused definitions, which have been reported.
     refused: Vec<VarId>,
+    /// Names that are defined but not declared, which have been reported.
+    undeclared: Vec<(InstanceId, String)>,
     data: HashMap<String, (u32, Unit)>,
 }
 
@@ -371,6 +373,7 @@ impl<'a> Flattener<'a> {
             open_consts: Vec::new(),
             models: Vec::new(),
             refused: Vec::new(),
+            undeclared: Vec::new(),
             unknowns: 0,
             derivatives_read: Vec::new(),
             most_nodes: MOST_NODES,
