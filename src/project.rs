@@ -220,18 +220,31 @@ pub fn make_folder_of(path: &Path) -> io::Result<()> {
     }
 }
 
-/// Writes a file atomically: into a temporary file beside it, which is then renamed.
+/// Writes a file atomically: into a temporary file beside it, which is on the disk before it is renamed.
 ///
 /// # Errors
 /// Why not; an existing file of that name is then unchanged.
 pub fn write(path: &Path, bytes: &[u8]) -> io::Result<()> {
+    write_with(path, bytes, true)
+}
+
+/// As [`write`], but does not wait for the disk, which takes longer than many a run: for results, which the same command
+/// makes again if the power fails meanwhile.
+///
+/// # Errors
+/// As `write`.
+pub fn write_result(path: &Path, bytes: &[u8]) -> io::Result<()> {
+    write_with(path, bytes, false)
+}
+
+fn write_with(path: &Path, bytes: &[u8], synced: bool) -> io::Result<()> {
     make_folder_of(path)?;
     match fs::metadata(path) {
         // A pipe or a device is written directly; it must not be replaced by a file.
         Ok(old) if !old.is_file() => fs::OpenOptions::new().write(true).open(path)?.write_all(bytes),
         // The new file has the permissions of the old one, and is never readable by anybody else, even briefly.
-        Ok(old) => replace(path, bytes, 0o600, Some(old.permissions())),
-        Err(_) => replace(path, bytes, 0o666, None),
+        Ok(old) => replace(path, bytes, 0o600, Some(old.permissions()), synced),
+        Err(_) => replace(path, bytes, 0o666, None, synced),
     }
 }
 
@@ -249,11 +262,11 @@ pub fn write_secret(path: &Path, bytes: &[u8]) -> io::Result<()> {
     if fs::symlink_metadata(path).is_ok() {
         return Err(io::ErrorKind::AlreadyExists.into());
     }
-    replace(path, bytes, 0o600, None)
+    replace(path, bytes, 0o600, None, true)
 }
 
-/// Writes a temporary file with this mode, then sets its permissions and renames it.
-fn replace(path: &Path, bytes: &[u8], mode: u32, permissions: Option<fs::Permissions>) -> io::Result<()> {
+/// Writes a temporary file with this mode, then sets its permissions and renames it. `synced`: waits for the disk before.
+fn replace(path: &Path, bytes: &[u8], mode: u32, permissions: Option<fs::Permissions>, synced: bool) -> io::Result<()> {
     let name = path.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
     let neighbour = path.with_file_name(format!(".{name}.{}", std::process::id()));
     // A file of that name was left by a killed process, or is a symbolic link set as a trap: never write through it.
@@ -267,7 +280,7 @@ fn replace(path: &Path, bytes: &[u8], mode: u32, permissions: Option<fs::Permiss
     let _ = mode;
     let written = options
         .open(&neighbour)
-        .and_then(|mut file| file.write_all(bytes).and_then(|()| file.sync_all()))
+        .and_then(|mut file| file.write_all(bytes).and_then(|()| if synced { file.sync_all() } else { Ok(()) }))
         .and_then(|()| permissions.map_or(Ok(()), |permissions| fs::set_permissions(&neighbour, permissions)))
         .and_then(|()| fs::rename(&neighbour, path));
     if written.is_err() {

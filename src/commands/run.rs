@@ -300,7 +300,7 @@ impl Written {
             self.output.extend_from_slice(bytes);
             return Ok(());
         }
-        project::write(path, bytes).map_err(|error| (path.to_path_buf(), error.to_string()))?;
+        project::write_result(path, bytes).map_err(|error| (path.to_path_buf(), error.to_string()))?;
         self.names.push(format!("{}{remark}", path.display()));
         Ok(())
     }

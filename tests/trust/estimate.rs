@@ -151,7 +151,7 @@ impl Survey<'_> {
         let Some(mut outcome) = go(case, solver) else { return };
         let experiment = Experiment { solver, ..case.experiment.unrecorded() };
         let before = outcome.clone();
-        estimate::errors(&case.instance, &experiment, &mut outcome, &mut |_| Continue::Continue(()));
+        estimate::errors(&case.instance, &experiment, &mut outcome, &|_| Continue::Continue(()));
         let found = readings(&outcome);
         if found.len() != truth.len() {
             return;
@@ -329,7 +329,7 @@ fn a_contact_that_holds_just_before_a_point_of_all_steps_is_judged() {
         let cases = compiled(&mut loaded, "stop", Changes::default());
         let case = cases.unwrap_or_else(|| panic!("FRIC_SEED={seed}: it does not compile\n{text}")).remove(0);
         let mut outcome = go(&case, case.experiment.solver).expect("it runs");
-        estimate::errors(&case.instance, &case.experiment, &mut outcome, &mut |_| Continue::Continue(()));
+        estimate::errors(&case.instance, &case.experiment, &mut outcome, &|_| Continue::Continue(()));
         let truths = [m * (start * start - band * band) / (2.0 * coulomb), holds];
         for (reading, truth) in readings(&outcome).into_iter().zip(truths) {
             let (error, estimate) = ((reading.value - truth).abs(), reading.error.expect("it was asked for"));

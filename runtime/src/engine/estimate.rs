@@ -46,14 +46,15 @@ const STEPS: [f64; 2] = [0.5, 0.25];
 const MOST_WORK: f64 = 64.0;
 
 /// Estimates the errors of an outcome, as [`errors`] does, and searches for a solver that decides the undecided
-/// verdicts.
+/// verdicts. `in_parallel`: with several threads, for a run that is alone; the results are the same.
 pub fn judge(
     instance: &Instance,
     experiment: &Experiment,
     outcome: &mut Outcome,
-    watch: &mut dyn FnMut(f64) -> Continue,
+    in_parallel: bool,
+    watch: &(dyn Fn(f64) -> Continue + Sync),
 ) {
-    let Some(mut companions) = accompanied(instance, experiment, outcome, watch) else { return };
+    let Some(mut companions) = accompanied(instance, experiment, outcome, in_parallel, watch) else { return };
     let failed = outcome.estimate.as_ref().is_some_and(|estimate| estimate.failed.is_some());
     if !failed && outcome.verdicts.iter().any(|verdict| !verdict.decided) {
         let decides = companions.decides(&outcome.verdicts, outcome.work.steps, watch);
@@ -67,9 +68,9 @@ pub fn errors(
     instance: &Instance,
     experiment: &Experiment,
     outcome: &mut Outcome,
-    watch: &mut dyn FnMut(f64) -> Continue,
+    watch: &(dyn Fn(f64) -> Continue + Sync),
 ) {
-    accompanied(instance, experiment, outcome, watch);
+    accompanied(instance, experiment, outcome, false, watch);
 }
 
 /// Writes the errors into the outcome and returns the companion runs; none where the outcome is unchanged.
@@ -77,14 +78,15 @@ fn accompanied<'a>(
     instance: &'a Instance,
     experiment: &Experiment,
     outcome: &mut Outcome,
-    watch: &mut dyn FnMut(f64) -> Continue,
+    in_parallel: bool,
+    watch: &(dyn Fn(f64) -> Continue + Sync),
 ) -> Option<Companions<'a>> {
     if experiment.expects.is_empty() {
         return None;
     }
     let bare = experiment.unrecorded();
     let adaptive = instance.adaptive().filter(|_| experiment.solver.method != Method::Adaptive);
-    let mut companions = Companions { instance, adaptive, bare, runs: Vec::new(), stepped: Vec::new() };
+    let mut companions = Companions { instance, in_parallel, adaptive, bare, runs: Vec::new(), stepped: Vec::new() };
     companions.runs.push((experiment.solver, Ok(outcome.verdicts.clone())));
     let mut judged = None;
     if companions.refer(outcome.work.steps, watch)? {
@@ -130,9 +132,27 @@ fn finer(solver: &Solver) -> Vec<Solver> {
 /// A run: its solver, and its verdicts or why it did not reach its end.
 type Run = (Solver, Result<Vec<Verdict>, String>);
 
+/// The results of `work`, in order; with `in_parallel` each in a thread of its own.
+fn side_by_side<T: Send, R: Send>(in_parallel: bool, given: Vec<T>, work: impl Fn(T) -> R + Sync) -> Vec<R> {
+    if !in_parallel {
+        return given.into_iter().map(work).collect();
+    }
+    std::thread::scope(|scope| {
+        let work = &work;
+        let mut given = given.into_iter();
+        let first = given.next();
+        let others: Vec<_> = given.map(|one| scope.spawn(move || work(one))).collect();
+        let first = first.map(work);
+        let others = others.into_iter().map(|one| one.join().unwrap_or_else(|why| std::panic::resume_unwind(why)));
+        first.into_iter().chain(others).collect()
+    })
+}
+
 /// The runs of one experiment.
 struct Companions<'a> {
     instance: &'a Instance,
+    /// Whether companions of the same kind run at the same time. Their results are the same.
+    in_parallel: bool,
     /// The same program for adaptive runs, if the experiment has fixed steps and is compared with adaptive runs.
     adaptive: Option<Instance>,
     /// The experiment without plots.
@@ -146,11 +166,10 @@ struct Companions<'a> {
 impl Companions<'_> {
     /// Makes the adaptive reference runs for `steps` fixed steps; false if that is impossible, none if the caller
     /// stopped it.
-    fn refer(&mut self, steps: u64, watch: &mut dyn FnMut(f64) -> Continue) -> Option<bool> {
+    fn refer(&mut self, steps: u64, watch: &(dyn Fn(f64) -> Continue + Sync)) -> Option<bool> {
         let Some(instance) = &self.adaptive else { return Some(false) };
         let most = LOOKS + LOOKS_PER_STEP * steps as f64;
-        let mut found = Vec::new();
-        for (tol, finer) in REFERENCES {
+        let reference = |(tol, finer): (f64, f64)| {
             let solver = Solver { method: Method::Adaptive, step: 0.0, tol, parts: finer * PARTS };
             let (mut looks, mut stopped) = (0.0, false);
             let mut within = |fraction: f64| {
@@ -159,23 +178,36 @@ impl Companions<'_> {
                 if stopped || looks > most { Continue::Break(()) } else { Continue::Continue(()) }
             };
             let ended = engine::run(instance.clone(), &Experiment { solver, ..self.bare.clone() }, &mut within);
-            if stopped {
-                return None;
-            }
-            let Ok(outcome) = ended else { return Some(false) };
-            found.push((solver, Ok(outcome.verdicts)));
+            (solver, ended.map(|outcome| outcome.verdicts), stopped)
+        };
+        let found = side_by_side(self.in_parallel, REFERENCES.to_vec(), reference);
+        if found.iter().any(|(.., stopped)| *stopped) {
+            return None;
         }
-        self.runs.extend(found);
-        Some(true)
+        let found: Option<Vec<Run>> =
+            found.into_iter().map(|(solver, verdicts, _)| Some((solver, Ok(verdicts.ok()?)))).collect();
+        let is_possible = found.is_some();
+        self.runs.extend(found.into_iter().flatten());
+        Some(is_possible)
     }
 
     /// Makes these runs; none if the caller stopped one.
-    fn run_all(&mut self, solvers: Vec<Solver>, watch: &mut dyn FnMut(f64) -> Continue) -> Option<()> {
-        solvers.into_iter().all(|solver| self.run(solver, watch)).then_some(())
+    fn run_all(&mut self, solvers: Vec<Solver>, watch: &(dyn Fn(f64) -> Continue + Sync)) -> Option<()> {
+        let found = side_by_side(self.in_parallel, solvers, |solver| self.ran(solver, watch));
+        let going = found.iter().all(|(_, going)| *going);
+        self.runs.extend(found.into_iter().map(|(run, _)| run));
+        going.then_some(())
     }
 
     /// Makes one more run; false if the caller stopped it.
-    fn run(&mut self, solver: Solver, watch: &mut dyn FnMut(f64) -> Continue) -> bool {
+    fn run(&mut self, solver: Solver, watch: &(dyn Fn(f64) -> Continue + Sync)) -> bool {
+        let (run, going) = self.ran(solver, watch);
+        self.runs.push(run);
+        going
+    }
+
+    /// A run by this solver; false if the caller stopped it.
+    fn ran(&self, solver: Solver, watch: &(dyn Fn(f64) -> Continue + Sync)) -> (Run, bool) {
         let plant = self.bare.bench.as_ref().map(|bench| &bench.plant);
         let stepped = plant.unwrap_or(self.instance).description();
         let (mut going, mut result) = (true, Err("its delays reach back over more steps than are kept".into()));
@@ -186,12 +218,11 @@ impl Companions<'_> {
                 // No window extends past the end of the experiment.
                 experiment.expects.iter_mut().for_each(|expect| expect.before = expect.before.min(self.bare.duration));
             }
-            let ended = engine::run(self.instance.clone(), &experiment, watch);
+            let ended = engine::run(self.instance.clone(), &experiment, &mut |done| watch(done));
             going = !ended.as_ref().is_err_and(|failure| failure.cause == Cause::Stopped);
             result = ended.map(|outcome| outcome.verdicts).map_err(|failure| failure.to_string());
         }
-        self.runs.push((solver, result));
-        going
+        ((solver, result), going)
     }
 
     /// The verdicts of run `of`, judged by more accurate ones.
@@ -233,7 +264,7 @@ impl Companions<'_> {
 
     /// The coarsest solver found that decides everything. `open`: the verdicts of the first run, which took `steps`
     /// steps.
-    fn decides(&mut self, open: &[Verdict], steps: u64, watch: &mut dyn FnMut(f64) -> Continue) -> Option<Solver> {
+    fn decides(&mut self, open: &[Verdict], steps: u64, watch: &(dyn Fn(f64) -> Continue + Sync)) -> Option<Solver> {
         let decided = |verdicts: &[Verdict]| !verdicts.is_empty() && verdicts.iter().all(|verdict| verdict.decided);
         let (own, references) = (self.runs[0].0, 1..self.runs.len());
         let adaptive = own.method == Method::Adaptive;

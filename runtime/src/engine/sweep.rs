@@ -58,7 +58,7 @@ pub fn run(cases: &[Case], watch: &(dyn Fn(f64) -> Continue + Sync)) -> Vec<Resu
 pub fn judge(cases: &[Case], results: &mut [Result<Outcome, Failure>], watch: &(dyn Fn(f64) -> Continue + Sync)) {
     let judge = |(case, result): (&Case, &mut Result<Outcome, Failure>)| {
         if let Ok(outcome) = result {
-            estimate::judge(&case.instance, &case.experiment, outcome, &mut |done| watch(done));
+            estimate::judge(&case.instance, &case.experiment, outcome, cases.len() == 1, watch);
         }
     };
     match cases {

@@ -94,14 +94,14 @@ impl SweepTable {
     /// The verdicts of a run with their errors, and its companions; `Some(None)` if the run does not reach its end, and
     /// `None` if `stopped` was set.
     fn judged(&self, number: u64, dice: &Dice, stopped: &AtomicBool) -> Option<Option<Judged>> {
-        let watch = &mut |_: f64| match stopped.load(Ordering::Relaxed) {
+        let watch = &|_: f64| match stopped.load(Ordering::Relaxed) {
             true => Continue::Break(()),
             false => Continue::Continue(()),
         };
         let Ok((run, PreparedRun { instance, experiment })) = self.fitted(number, dice) else { return Some(None) };
         // With guards on ranges, as for the row: a run that left a range has no error either.
         let (case, description) = (&self.cases[run.at], run.description);
-        let ended = engine::run(instance.clone(), &experiment, watch).ok().filter(|outcome| {
+        let ended = engine::run(instance.clone(), &experiment, &mut { watch }).ok().filter(|outcome| {
             let watched = &outcome.verdicts[case.expects()..];
             case.left(&description, &watched.iter().map(extremes).collect::<Vec<_>>()).is_none()
         });
