@@ -412,10 +412,13 @@ mod tests {
     use abi::plan::{Formula, MeasureKind};
 
     fn judged(instance: &Instance, experiment: &Experiment) -> Outcome {
-        let mut go_on = |_| Continue::Continue(());
-        let mut outcome = engine::run(instance.clone(), experiment, &mut go_on).unwrap();
+        let go_on = |_| Continue::Continue(());
+        let mut outcome = engine::run(instance.clone(), experiment, &mut { go_on }).unwrap();
         let before = outcome.clone();
-        judge(instance, experiment, &mut outcome, &mut go_on);
+        judge(instance, experiment, &mut outcome, false, &go_on);
+        let mut again = before.clone();
+        judge(instance, experiment, &mut again, true, &go_on);
+        assert_eq!(format!("{again:?}"), format!("{outcome:?}"), "companions run in parallel");
         assert_eq!((&before.finals, before.work), (&outcome.finals, outcome.work));
         for (a, b) in before.verdicts.iter().zip(&outcome.verdicts) {
             assert!(a.readings.iter().zip(&b.readings).all(|(a, b)| a.value.to_bits() == b.value.to_bits()));
