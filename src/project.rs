@@ -228,7 +228,7 @@ pub fn write(path: &Path, bytes: &[u8]) -> io::Result<()> {
     write_with(path, bytes, true)
 }
 
-/// As [`write`], but does not wait for the disk, which takes longer than many a run: for results, which the same command
+/// As [`write()`], but does not wait for the disk, which takes longer than many a run: for results, which the same command
 /// makes again if the power fails meanwhile.
 ///
 /// # Errors

@@ -414,19 +414,24 @@ fn operator(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
 /// said about it, and what to write.
 const FOREIGN: &[(&[&str], &str, &str)] = &[
     (
-        &["while", "for", "foreach", "loop", "repeat", "do"],
+        &["while", "repeat", "do"],
         "there are no loops",
-        "every equation holds at every instant; for several equal parts write\n`part el[i in 1 .. 4] = Model(k = i)` and `sum(el.f)`, for several runs `sweep`",
+        "an equation that holds under a condition is a choice:\n`dv/dt = if v > 0 m/s then u / m else 0 m/s^2`; regimes that remember are `mode`s",
+    ),
+    (
+        &["for", "foreach", "loop"],
+        "there are no loops",
+        "time needs none: every equation holds at every instant. For several equal parts write\n`part el[i in 1 .. 4] = Model(k = i)` and `sum(el.f)`, for several runs `sweep`",
     ),
     (
         &["switch", "case", "otherwise"],
         "a choice is a value, not a statement: every equation holds at all times",
-        "write `F = if v > 0 m/s then a else if v < 0 m/s then b else c`; regimes with a memory are `mode`s",
+        "write `let F = if v > 0 m/s then a else if v < 0 m/s then b else c`; regimes that remember are `mode`s",
     ),
     (
         &["persistent", "global", "static"],
         "what keeps its value is a state",
-        "in sampled code write `state y1 [m] = 0`, and `next(y1) = y` in `every Ts { … }`; what never changes is a `param` of a model, or for the whole file `const g = 9.81 m/s^2`",
+        "in sampled code write `state y [m] = 0` and `every 1 ms { next(y) = … }`: `y` is the value of the last sample;\nwhat never changes is a `param` of a model, or for the whole file `const g = 9.81 m/s^2`",
     ),
     (
         &["disp", "fprintf", "printf", "print", "display", "sprintf"],
@@ -434,27 +439,17 @@ const FOREIGN: &[(&[&str], &str, &str)] = &[
         "write `show max(F)`; its value is printed after the run",
     ),
     (
-        &[
-            "subplot",
-            "figure",
-            "axis",
-            "xlim",
-            "ylim",
-            "grid",
-            "legend",
-            "xlabel",
-            "ylabel",
-            "title",
-            "hold",
-            "semilogx",
-            "semilogy",
-            "loglog",
-            "tiledlayout",
-            "nexttile",
-            "yyaxis",
-            "saveas",
-            "exportgraphics",
-        ],
+        &["subplot", "figure", "hold", "tiledlayout", "nexttile"],
+        "how a figure looks is said by `plot`",
+        "leave the line out: each `plot` is a panel, and `plot F, u` draws two curves into one;\npanels side by side: `fric run FILE --plot fig.pdf --columns 2`",
+    ),
+    (
+        &["xlabel", "ylabel", "legend", "title"],
+        "how a figure looks is said by `plot`",
+        "leave the line out: axes have the names and units of what they show;\n`plot F as \"friction\" title \"…\"` names a curve and its panel",
+    ),
+    (
+        &["axis", "xlim", "ylim", "grid", "semilogx", "semilogy", "loglog", "yyaxis", "saveas", "exportgraphics"],
         "how a figure looks is said by `plot`",
         "write `plot F [N] as \"friction\" in 0 N .. 2 N against v log after 1 s title \"…\"`, and a `plot` for each panel;\nsize, columns and file are options: `fric run FILE --plot fig.pdf --size 85x60mm --columns 2`",
     ),

@@ -114,8 +114,10 @@ pub struct At {
 /// The margins of a loop. A margin is missing if L has no such crossing.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Margins {
-    /// Whether the closed loop is stable.
+    /// Whether the closed loop is stable: all of its deviations decay.
     pub stable: bool,
+    /// Whether some deviations stay as they are and all others decay: a contact at rest keeps any small displacement.
+    pub neutral: bool,
     /// The smallest phase lag that would make a stable loop unstable, at |L| = 1.
     pub phase: Option<At>,
     /// The smallest factor above 1 by which the gain may grow.
@@ -378,16 +380,27 @@ impl OpenLoop {
         if closed.iter().all(|entry| entry.is_finite()) { Ok(closed) } else { Err(Unbroken::NotFinite) }
     }
 
-    /// Whether the loop is stable when it is closed; in continuous time without its delay.
-    fn closed_is_stable(&self) -> Result<bool, Unbroken> {
-        let modes = OpenLoop::eigenvalues(&self.closed()?)?;
-        Ok(match self.period {
-            Some(_) => modes.iter().all(|mode| mode.frequency() < 1.0 - SAME),
-            None => {
-                let fastest = modes.iter().map(|mode| mode.frequency()).fold(0.0, f64::max);
-                modes.iter().all(|mode| mode.real < -1e-12 * fastest)
-            }
-        })
+    /// Whether the loop is stable when it is closed, and whether it is neutral; in continuous time without its delay.
+    fn closed_is_stable(&self) -> Result<(bool, bool), Unbroken> {
+        let closed = self.closed()?;
+        let modes = OpenLoop::eigenvalues(&closed)?;
+        let fastest = modes.iter().map(|mode| mode.frequency()).fold(0.0, f64::max);
+        // Where deviations stay, and what counts as rounding there.
+        let (limit, rounding) = if self.period.is_some() { (1.0, SAME) } else { (0.0, 1e-12 * fastest) };
+        let decays = |mode: &&Mode| match self.period {
+            Some(_) => mode.frequency() < limit - rounding,
+            None => mode.real < -rounding,
+        };
+        let others: Vec<&Mode> = modes.iter().filter(|mode| !decays(mode)).collect();
+        let stays = |mode: &&Mode| (mode.real - limit).abs() <= rounding && mode.imaginary.abs() <= rounding;
+        if others.is_empty() || !others.iter().all(stays) {
+            return Ok((others.is_empty(), false));
+        }
+        // As many independent deviations stay as there are such eigenvalues; with fewer, one drives another.
+        let moved = closed - DMatrix::identity(self.a.nrows(), self.a.nrows()) * limit;
+        let values = moved.singular_values();
+        let still = values.iter().filter(|value| **value <= SAME * values.max()).count();
+        Ok((false, still == others.len()))
     }
 
     /// Frequencies in rad/s at which L is examined: even in the logarithm up to half the sampling frequency, and denser
@@ -462,8 +475,10 @@ impl OpenLoop {
     /// # Errors
     /// If its eigenvalues cannot be computed.
     pub fn margins(&self, bode: &[Point]) -> Result<Margins, Unbroken> {
+        let (stable, neutral) = self.closed_is_stable()?;
         let mut found = Margins {
-            stable: self.closed_is_stable()?,
+            stable,
+            neutral,
             phase: None,
             gain: None,
             reduction: None,
@@ -516,7 +531,8 @@ impl OpenLoop {
             }
         }
         if self.period.is_none() && self.delay > 0.0 {
-            found.stable = found.stable && self.keeps_stable()?;
+            let keeps = (found.stable || found.neutral) && self.keeps_stable()?;
+            (found.stable, found.neutral) = (found.stable && keeps, found.neutral && keeps);
         }
         Ok(found)
     }
@@ -605,6 +621,27 @@ mod tests {
         }
         assert!(!margins(&integrator(201.0, 0.01, 0.0)).stable);
         assert!(margins(&integrator(199.0, 0.01, 0.0)).stable);
+    }
+
+    /// v' = −c v − K x − k z + w, x' = z' = v: a bristle z that moves with x keeps the difference of the two. The loop is
+    /// neutral if all else decays and that difference drives nothing that adds it up.
+    #[test]
+    fn a_loop_with_a_resting_contact_is_neutral() {
+        for (damping, neutral) in [(0.5, true), (-0.5, false)] {
+            let flow = [-damping, -2.0, -3.0, 1.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0];
+            let found = margins(&continuous(3, &flow, &[0.0, -2.0, 0.0]));
+            assert_eq!((found.stable, found.neutral), (false, neutral), "{damping}");
+        }
+        // q' = z − x pushes, too.
+        let flow = [
+            [-0.5, -2.0, -3.0, -1.0, 1.0],
+            [1.0, 0.0, 0.0, 0.0, 0.0],
+            [1.0, 0.0, 0.0, 0.0, 0.0],
+            [0.0, -1.0, 1.0, 0.0, 0.0],
+        ];
+        let found = margins(&continuous(4, flow.as_flattened(), &[0.0, -2.0, 0.0, 0.0]));
+        assert_eq!((found.stable, found.neutral), (false, false));
+        assert!(!margins(&integrator(10.0, 0.01, 0.0)).neutral);
     }
 
     /// A computation delay of d turns L by −ω d if it is a whole number of periods; by part of a period the integrator

@@ -178,7 +178,11 @@ impl Points {
 
     /// Shows the step from where it was shown last up to θ, whose point has the time `time`.
     pub(crate) fn until(&mut self, system: &mut System, step: &Step, theta: f64, time: f64) -> Result<(), Stop> {
-        while let Some(instant) = self.observer.probe.next().filter(|instant| *instant <= time) {
+        // An instant at the end of the step has the values after a tick or an event there: it is shown by `here`, by the
+        // next step, or at the end of the run. Ticks are multiples of a period and instants those of a decimal: they may
+        // differ in the last bit.
+        let before = time * (1.0 - 4.0 * f64::EPSILON);
+        while let Some(instant) = self.observer.probe.next().filter(|instant| *instant < before) {
             step.at(((instant - step.t) / step.h).clamp(0.0, theta), &mut self.x);
             system.place(instant, &self.x);
             self.probe(system)?;

@@ -171,7 +171,13 @@ fn margin_words(margins: &Margins) -> String {
     line("delay margin", delay.unwrap_or_else(|| none("the gain is 1 at no frequency")));
     let most = &margins.sensitivity;
     line("sensitivity", format!("at most {} {}", significant(most.value, 3), at(most)));
-    out + if margins.stable { "  the closed loop is stable\n" } else { "  the closed loop is unstable\n" }
+    out + match (margins.stable, margins.neutral) {
+        (true, _) => "  the closed loop is stable\n",
+        (false, true) => {
+            "  the closed loop is neutral: some deviations neither decay nor grow, as of a contact at rest\n"
+        }
+        (false, false) => "  the closed loop is unstable\n",
+    }
 }
 
 /// Frequency, gain and phase as CSV.
@@ -213,7 +219,9 @@ fn figure(linear: &Linear, path: &str, open: &OpenLoop, bode: &[Point], margins:
     if let Some(limit) = &margins.gain {
         subtitle.push(format!("{} dB at {}", significant(decibels(limit.value), 3), hertz(limit.frequency)));
     }
-    if !margins.stable {
+    if margins.neutral {
+        subtitle.push("neutral when closed".into());
+    } else if !margins.stable {
         subtitle.push("unstable when closed".into());
     }
     Figure {
@@ -243,6 +251,7 @@ fn object(linear: &Linear, path: &str, open: &OpenLoop, bode: &[Point], margins:
         "delay": number(open.delay),
         "smoothed": smoothed,
         "stable": margins.stable,
+        "neutral": margins.neutral,
         "crossings": margins.crossings.iter().map(|frequency| number(frequency / TAU)).collect::<Value>(),
         "phase_margin": at(&margins.phase),
         "gain_margin": at(&margins.gain),
