@@ -329,10 +329,10 @@ fn common_slips_get_an_answer_to_paste() {
         &["E0001 `mode` `mode` is a word of the language (expected a name) | as a name write for example `mode_`"],
     );
     model_says("input v m/s", &["E0001 `m/s` the unit of a declaration stands in brackets () | write `input v [m/s]`"]);
-    model_says("let a = k +", &["E0001 `+` expected a value here (behind this)"]);
+    model_says("let a = k +", &["E0001 `+` expected a value here (after this)"]);
     model_says(
         "part fr = lugre",
-        &["E0001 `lugre` expected `(` here (behind this) | write `lugre()`, with arguments in the brackets"],
+        &["E0001 `lugre` expected `(` here (after this) | write `lugre()`, with arguments in the brackets"],
     );
     model_says(
         "let a = 1e999",
