@@ -9,8 +9,10 @@
 //!                   now NS                the time of its monotonic clock, several times a second
 //!                   energy SHARE CYCLES   the most that a contact gave back of what it can hold, and cycles without
 //!                                         prediction
-//!                   ok NUMBER             over WORDS
-//!                   refused NUMBER WORDS  problem WORDS
+//!                   ok NUMBER             the command of this number has been carried out
+//!                   refused NUMBER WORDS  it has not, and why
+//!                   over WORDS            how the run ended
+//!                   problem WORDS         what the panel cannot show, and why
 //! to the rig        NUMBER COMMAND        as at the prompt
 //!                   NUMBER @NS COMMAND    where the rig tells its time: the last one that came
 //! ```
@@ -30,7 +32,8 @@ use std::io::Write;
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
 use std::time::{Duration, Instant};
 
-/// Age of the picture from which a command is refused, s: a click that waited in a dead link must not arm a rig.
+/// A command is refused if the picture on which it was given is older than this, in s: a click that waited in a dead
+/// connection must not arm a rig.
 const OLD: f64 = 1.0;
 /// Commands that wait for their answer; the oldest is forgotten.
 const OPEN: usize = 64;

@@ -19,7 +19,7 @@ pub struct Twin {
     pub rig: Rig,
     /// The control program at its start.
     pub control: Instance,
-    /// The program of the part that the drives replace.
+    /// The program of the plant: the part of the model in whose place the drives are on the rig.
     pub plant: Instance,
     /// Values of parameters at that instant, SI.
     pub set: Vec<(Slot, f64)>,

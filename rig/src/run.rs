@@ -372,7 +372,7 @@ const PANELS: usize = 8;
 const WAITING: usize = 16;
 /// Time in which a line to a panel must be taken.
 const DEAF: Duration = Duration::from_millis(200);
-/// Intervals at which the stage is looked at, and at which the time is told.
+/// Intervals at which the stage is polled, and at which the time is sent.
 const TOLD: (Duration, Duration) = (Duration::from_millis(20), Duration::from_millis(100));
 
 /// Tells a panel something; false if it does not listen.

@@ -125,7 +125,7 @@ impl Drop for Running {
     }
 }
 
-/// The end of the window, as screen readers are told, s.
+/// The end of the window in the text for screen readers, s.
 fn to(page: &Page) -> f64 {
     let told = page.text("document.querySelector('.plot canvas[role=img]').getAttribute('aria-label') ?? ''");
     let to = told.split(" s to ").nth(1).and_then(|rest| rest.split(" s,").next()?.parse().ok());
@@ -154,7 +154,7 @@ fn a_rig_that_runs_is_followed_through_its_log() {
     // The space bar holds the picture, while more comes.
     page.value("document.activeElement.blur()");
     page.key(" ");
-    // What screen readers are told follows with up to half a second, or later on a busy machine.
+    // The text for screen readers follows with up to half a second, or later on a busy machine.
     let (begun, mut held) = (Instant::now(), to(&page));
     loop {
         std::thread::sleep(Duration::from_millis(1200));

@@ -36,7 +36,7 @@ impl Build {
         Build { name: name.into(), ..Build::default() }
     }
 
-    /// As [`new`](Build::new), with room for about so many operations.
+    /// As [`new`](Build::new), with capacity for this number of operations: below it, nothing is allocated or hashed again.
     pub fn roomy(name: &str, operations: usize) -> Build {
         let mut build = Build::new(name);
         build.ops.reserve(operations);

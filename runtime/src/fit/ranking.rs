@@ -16,8 +16,8 @@ pub struct Contender {
     pub held_out: Option<Vec<f64>>,
 }
 
-/// The piece of a row: consecutive rows of a recording over time, every tenth of steady points, whose order means
-/// nothing.
+/// The piece of the recording, of [`PIECES`], to which a row belongs. Rows over time are correlated with their neighbours, so
+/// a piece is a run of consecutive rows; the order of steady points means nothing, and a piece is every tenth of them.
 pub fn piece(row: usize, rows: usize, steady: bool) -> usize {
     if steady { row % PIECES } else { row * PIECES / rows }
 }
