@@ -7,7 +7,7 @@ use compiler::ir::random::Random;
 use compiler::{Case, Changes, Options};
 use runtime::engine::even_grid;
 use runtime::engine::{Continue, run};
-use support::Texts;
+use support::{Texts, number};
 
 fn compiled(text: &str) -> Case {
     let mut loaded = compiler::load("a.fric", text, &Texts::default());
@@ -29,9 +29,7 @@ fn rows(case: &Case, every: f64) -> Vec<Vec<f64>> {
 /// Mutant tried by hand: the window of a plot cuts the data although something is recorded (case 0 of seed 1).
 #[test]
 fn what_is_recorded_is_what_a_plot_shows() {
-    let from =
-        |name: &str, otherwise: u64| std::env::var(name).ok().and_then(|value| value.parse().ok()).unwrap_or(otherwise);
-    let (seed, runs) = (from("FRIC_SEED", 1), from("FRIC_RUNS", 40));
+    let (seed, runs) = (number("FRIC_SEED").unwrap_or(1), number("FRIC_RUNS").unwrap_or(40));
     let mut random = Random(seed);
     for number in 0..runs {
         let contact = ["KFM()", "Karnopp()", "LuGre(vd = 10 mm/s)", "Dahl()"][random.below(4)];
@@ -79,9 +77,7 @@ experiment e {{
 /// Mutant tried by hand: the rows of an adaptive run at the end of a step come before its tick (case 4 of seed 1).
 #[test]
 fn a_row_at_a_tick_has_what_the_tick_computed() {
-    let from =
-        |name: &str, otherwise: u64| std::env::var(name).ok().and_then(|value| value.parse().ok()).unwrap_or(otherwise);
-    let (seed, runs) = (from("FRIC_SEED", 1), from("FRIC_RUNS", 40));
+    let (seed, runs) = (number("FRIC_SEED").unwrap_or(1), number("FRIC_RUNS").unwrap_or(40));
     let mut random = Random(seed);
     for number in 0..runs {
         // In µs, so that neither periods nor rows are whole numbers of doubles.
@@ -124,9 +120,7 @@ experiment e {{
 /// the end of the step in place of a point of its polynomial (case 2).
 #[test]
 fn rows_of_a_grid_agree_with_the_run() {
-    let from =
-        |name: &str, otherwise: u64| std::env::var(name).ok().and_then(|value| value.parse().ok()).unwrap_or(otherwise);
-    let (seed, runs) = (from("FRIC_SEED", 1), from("FRIC_RUNS", 40));
+    let (seed, runs) = (number("FRIC_SEED").unwrap_or(1), number("FRIC_RUNS").unwrap_or(40));
     let mut random = Random(seed);
     let mut compared = 0;
     for number in 0..runs {

@@ -10,7 +10,7 @@ use compiler::ir::random::Random;
 use compiler::{Case, Changes, Options};
 use runtime::engine::lanes::{self, Next};
 use runtime::engine::{self, Continue, Failure, Outcome};
-use support::Texts;
+use support::{Texts, number};
 
 const TEXT: &str = r#"
 import std.interfaces
@@ -107,9 +107,7 @@ fn in_lanes_and_alone(varying: &Varying, path: &str, values: &[f64]) -> Vec<Resu
 #[test]
 #[cfg_attr(not(target_arch = "x86_64"), ignore = "lanes are for x86-64")]
 fn start_values_share_their_lanes() {
-    let from =
-        |name: &str, otherwise: u64| std::env::var(name).ok().and_then(|value| value.parse().ok()).unwrap_or(otherwise);
-    let (seed, draws) = (from("FRIC_SEED", 1), from("FRIC_RUNS", 16));
+    let (seed, draws) = (number("FRIC_SEED").unwrap_or(1), number("FRIC_RUNS").unwrap_or(16));
     let mut random = Random(seed);
     let mut apart = 0;
     for draw in 0..draws {

@@ -6,7 +6,7 @@ mod support;
 use compiler::ir::random::Random;
 use compiler::{Changes, Options};
 use runtime::engine::{Continue, every_step};
-use support::Texts;
+use support::{Texts, number};
 
 /// Steps of a run.
 const STEPS: usize = 4000;
@@ -121,9 +121,7 @@ fn check(model: &str, limits: &Limits, place: &str) -> [bool; 2] {
 /// exceeds v_max by its rounding in a long motion (case 10).
 #[test]
 fn motions_stay_within_their_limits_and_use_them() {
-    let from =
-        |name: &str, otherwise: u64| std::env::var(name).ok().and_then(|value| value.parse().ok()).unwrap_or(otherwise);
-    let (seed, runs) = (from("FRIC_SEED", 1), from("FRIC_RUNS", 150));
+    let (seed, runs) = (number("FRIC_SEED").unwrap_or(1), number("FRIC_RUNS").unwrap_or(150));
     let mut random = Random(seed);
     let mut kinds = [0; 4];
     for number in 0..runs {

@@ -14,7 +14,7 @@ use compiler::ir::random::Random;
 use compiler::{Changes, Loaded, Options};
 use grammar::ast::{DeclarationKind, EveryStatement, ExperimentStatement, Item, Statement};
 use runtime::engine::Continue;
-use support::Texts;
+use support::{Texts, number};
 
 /// Every state and output at the end as bits, or the error.
 type End = Result<Vec<(String, u64)>, String>;
@@ -101,9 +101,7 @@ fn places(loaded: &Loaded, experiment: &str, state: &str) -> Option<(std::ops::R
 
 #[test]
 fn an_initial_value_from_outside_equals_one_in_the_text() {
-    let from =
-        |name: &str, otherwise: u64| std::env::var(name).ok().and_then(|value| value.parse().ok()).unwrap_or(otherwise);
-    let (seed, runs) = (from("FRIC_SEED", 1), from("FRIC_RUNS", 60));
+    let (seed, runs) = (number("FRIC_SEED").unwrap_or(1), number("FRIC_RUNS").unwrap_or(60));
     let mut random = Random(seed);
     let texts = support::texts_below(&support::root().join("stdlib-models"));
     let (mut compared, mut refused, mut moved) = (0, 0, 0);

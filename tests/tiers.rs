@@ -25,11 +25,7 @@ use compiler::ir::random::Random;
 use runtime::engine::{Cause, Continue, Failure};
 use std::path::PathBuf;
 use std::sync::Arc;
-use support::Texts;
-
-fn number(name: &str) -> Option<u64> {
-    std::env::var(name).ok().map(|text| text.parse().unwrap_or_else(|_| panic!("{name} is a whole number")))
-}
+use support::{Texts, number};
 
 /// The first combination of an experiment; none if it cannot be stepped by this method.
 fn variant(name: &str, text: &str, experiment: &str, changes: Changes) -> Option<Variant> {

@@ -5,7 +5,7 @@
 mod support;
 
 use compiler::ir::random::Random;
-use support::{Texts, checked, line};
+use support::{Texts, checked, line, number};
 
 #[derive(Clone, Copy, PartialEq, Debug)]
 enum Counts {
@@ -96,9 +96,7 @@ model Rotor { state angle [rad] = 0  dangle/dt = 1 rad/s  output w = dangle/dt }
 /// functions are not read (case 95); `sin` takes what it gets (case 1).
 #[test]
 fn a_lost_factor_is_reported_and_nothing_else() {
-    let from =
-        |name: &str, otherwise: u64| std::env::var(name).ok().and_then(|value| value.parse().ok()).unwrap_or(otherwise);
-    let (seed, runs) = (from("FRIC_SEED", 1), from("FRIC_RUNS", 400));
+    let (seed, runs) = (number("FRIC_SEED").unwrap_or(1), number("FRIC_RUNS").unwrap_or(400));
     let mut random = Random(seed);
     let mut told = [0, 0];
     for number in 0..runs {

@@ -8,7 +8,7 @@ use abi::description::Kind;
 use abi::plan::Experiment;
 use compiler::{Changes, Loaded, Options};
 use runtime::engine::{Continue, run};
-use support::Texts;
+use support::{Texts, number};
 
 /// Outputs at the end, or none if it failed.
 type Ends = Option<Vec<(String, u64)>>;
@@ -184,9 +184,7 @@ fn vary_and_set_agree_for_everything_a_parameter_determines() {
 
 #[test]
 fn parameters_of_the_library() {
-    let from =
-        |name: &str, otherwise: u64| std::env::var(name).ok().and_then(|value| value.parse().ok()).unwrap_or(otherwise);
-    let (seed, runs) = (from("FRIC_SEED", 5), from("FRIC_RUNS", 40));
+    let (seed, runs) = (number("FRIC_SEED").unwrap_or(5), number("FRIC_RUNS").unwrap_or(40));
     let mut random = compiler::ir::random::Random(seed);
     let texts = support::texts_below(&support::root().join("stdlib-models"));
     let (mut compared, mut refused) = (0, 0);

@@ -116,23 +116,27 @@ fn recording(args: &Args, bell: &Bell, terminal: &Terminal) -> Result<Arc<Played
     Ok(played)
 }
 
-/// A panel with the commands of a rig's operator, and the link that opens it.
+/// Serves a panel with the commands of a rig's operator in a thread of its own. Prints its link after `words`, and shows
+/// it in a browser.
 fn operate(
     args: &Args,
     operated: &Arc<Operated>,
     bell: &Bell,
+    words: &str,
     terminal: &mut Terminal,
-) -> Result<(Panel, String), End> {
-    match Panel::open(args.port, operated.clone(), bell.clone()) {
-        Ok(open) => {
-            let link = open.link();
-            Ok((open, link))
-        }
+) -> Result<Option<tempfile::NamedTempFile>, End> {
+    let open = match Panel::open(args.port, operated.clone(), bell.clone()) {
+        Ok(open) => open,
         Err(why) => {
             terminal.error(&format!("no panel: {why}"));
-            Err(End::Failed)
+            return Err(End::Failed);
         }
-    }
+    };
+    let link = open.link();
+    terminal.line(&format!("{words}{link}"));
+    let door = (!args.no_open).then(|| show(&link)).flatten();
+    std::thread::spawn(move || open.serve());
+    Ok(door)
 }
 
 /// Shows the log of a rig that runs, once it has begun: for a thread of its own. `more`: whether it may still grow.
@@ -153,13 +157,10 @@ fn show_log(operated: &Operated, file: &Path, interpret: bool, keep: u64, bell: 
 fn of_rig(args: &Args, started: &str, bell: &Bell, terminal: &mut Terminal) -> End {
     let name = args.file.file_stem().unwrap_or_default().to_string_lossy().into_owned();
     let operated = Arc::new(Operated::new(&name, Box::new(std::io::stdout()), bell.clone()));
-    let (open, link) = match operate(args, &operated, bell, terminal) {
-        Ok(open) => open,
+    let _door = match operate(args, &operated, bell, "link ", terminal) {
+        Ok(door) => door,
         Err(end) => return end,
     };
-    terminal.line(&format!("link {link}"));
-    let _door = (!args.no_open).then(|| show(&link)).flatten();
-    std::thread::spawn(move || open.serve());
     {
         let (operated, file, bell) = (operated.clone(), args.file.clone(), bell.clone());
         let (started, interpret, keep) = (started.to_string(), args.interpret, args.keep);
@@ -198,13 +199,10 @@ fn of_host(args: &Args, host: &str, bell: &Bell, terminal: &mut Terminal) -> End
             return End::Failed;
         }
     };
-    let (open, link) = match operate(args, &operated, bell, terminal) {
-        Ok(open) => open,
+    let _door = match operate(args, &operated, bell, "panel  ", terminal) {
+        Ok(door) => door,
         Err(end) => return end,
     };
-    terminal.line(&format!("panel  {link}"));
-    let _door = (!args.no_open).then(|| show(&link)).flatten();
-    std::thread::spawn(move || open.serve());
     let (begun, first) = mpsc::channel::<PathBuf>();
     let following = {
         let (operated, bell, goes_on) = (operated.clone(), bell.clone(), feed.goes_on.clone());

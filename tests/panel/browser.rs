@@ -213,6 +213,23 @@ impl Page {
         }
     }
 
+    /// Does what an operator does, until it has an effect. On a busy machine the picture may be too old for a command,
+    /// which is refused then: an operator gives it again.
+    #[track_caller]
+    pub fn again(&self, act: &dyn Fn(), effect: &str) {
+        for _ in 0..20 {
+            act();
+            let begun = Instant::now();
+            while begun.elapsed() < Duration::from_secs(3) {
+                if self.value(&format!("!!({effect})")) == true {
+                    return;
+                }
+                std::thread::sleep(Duration::from_millis(50));
+            }
+        }
+        self.wait(effect);
+    }
+
     fn events(&self, method: &str) -> Vec<Value> {
         let events = browser().events.lock().unwrap();
         let own = events.get(&self.session).into_iter().flatten();

@@ -117,21 +117,7 @@ fn a_rig_is_armed_set_and_stopped_from_the_page() {
         page.value(&format!("(() => {{ const f = {row}.querySelector('input'); f.focus(); f.select(); }})()"));
         page.typed(text);
     };
-    // Two changes are prepared, and sent as one set. On a busy machine the picture may be too old for a command, which is
-    // refused then: an operator gives it again.
-    let again = |give: &dyn Fn(), done: &str| {
-        for _ in 0..20 {
-            give();
-            let begun = Instant::now();
-            while begun.elapsed() < Duration::from_secs(3) {
-                if page.value(&format!("!!({done})")) == true {
-                    return;
-                }
-                std::thread::sleep(Duration::from_millis(50));
-            }
-        }
-        page.wait(done);
-    };
+    // Two changes are prepared, and sent as one set.
     let happened = |what: &str| format!("document.getElementById('happened').textContent.includes('{what}')");
     let both = || {
         typed(&first, "0.45 N·m");
@@ -142,7 +128,7 @@ fn a_rig_is_armed_set_and_stopped_from_the_page() {
         page.shot("rig-staged");
         page.key("Enter");
     };
-    again(&both, &happened("fr.Fs = 0.45 N·m"));
+    page.again(&both, &happened("fr.Fs = 0.45 N·m"));
     page.wait(&happened("fr.Fc = 0.29 N·m"));
     page.wait(&format!("{first}.querySelector('input').value === '0.45 N·m'"));
     // A set that a start would refuse is refused with its reason, and changes nothing.
@@ -150,7 +136,7 @@ fn a_rig_is_armed_set_and_stopped_from_the_page() {
         typed(&first, "-1 N·m");
         page.key("Enter");
     };
-    again(&wrong, "document.getElementById('problem').textContent.includes('E0502')");
+    page.again(&wrong, "document.getElementById('problem').textContent.includes('E0502')");
     let why = page.text("document.getElementById('problem').textContent");
     assert!(why.contains("“set fr.Fs = -1 N·m” is refused"), "{why}");
     page.wait(&format!("{first}.querySelector('input').value === '0.45 N·m'"));

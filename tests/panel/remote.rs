@@ -153,21 +153,6 @@ fn typed(page: &Page, path: &str, text: &str) {
     page.key("Enter");
 }
 
-/// What an operator does, until it has an effect: on a busy machine a command may be too old.
-fn again(page: &Page, act: &dyn Fn(), effect: &str) {
-    for _ in 0..20 {
-        act();
-        let begun = Instant::now();
-        while begun.elapsed() < Duration::from_secs(3) {
-            if page.value(&format!("!!({effect})")) == true {
-                return;
-            }
-            std::thread::sleep(Duration::from_millis(50));
-        }
-    }
-    page.wait(effect);
-}
-
 /// What the page of the packed rig shows and does, on whichever computer it is served.
 fn operated(page: &Page) {
     sentence(page, "armed, the model runs");
@@ -180,9 +165,8 @@ fn operated(page: &Page) {
         page.value("[...document.querySelectorAll('.knob b')].map(b => b.textContent)"),
         json!(["fr.vs", "fr.Fs"])
     );
-    again(page, &|| typed(page, "fr.Fs", "0.5 N·m"), &happened("fr.Fs = 0.5 N·m"));
-    again(
-        page,
+    page.again(&|| typed(page, "fr.Fs", "0.5 N·m"), &happened("fr.Fs = 0.5 N·m"));
+    page.again(
         &|| typed(page, "fr.Fs", "0.7 N·m"),
         "document.getElementById('problem').textContent.includes('from 0.3 N·m to 0.6 N·m (`tune`), not to 0.7 N·m')",
     );
@@ -193,7 +177,7 @@ fn operated(page: &Page) {
         page.typed("second bearing");
         page.key("Enter");
     };
-    again(page, &mark, &happened("second bearing"));
+    page.again(&mark, &happened("second bearing"));
 }
 
 fn replayed(log: &Path) {

@@ -16,6 +16,11 @@ pub fn root() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR"))
 }
 
+/// A whole number from the environment, such as `FRIC_SEED`.
+pub fn number(name: &str) -> Option<u64> {
+    std::env::var(name).ok().map(|text| text.parse().unwrap_or_else(|_| panic!("{name} is a whole number")))
+}
+
 /// Dotted names and texts of the library, in the order of the names.
 static LIBRARY: LazyLock<Vec<(String, String)>> = LazyLock::new(|| {
     let folder = root().join("stdlib-models");

@@ -38,15 +38,7 @@ pub fn check(system: &System, types: &Types, files: &Files, diagnostics: &mut Ve
     if !vars && !system.nodes.iter().any(nodes) {
         return;
     }
-    let mut reader = Reader {
-        system,
-        types,
-        files,
-        of_nodes: vec![None; system.nodes.len()],
-        of_vars: vec![None; system.vars.len()],
-        depth: 0,
-        found: Vec::new(),
-    };
+    let mut reader = Reader::new(system, types, files);
     // Products inside of products are judged as a whole.
     let mut inner = HashSet::default();
     for node in &system.nodes {
@@ -72,15 +64,7 @@ pub fn shown_in(
     (expr, unit): (ExprId, &Unit),
     place: Span,
 ) -> Option<Diagnostic> {
-    let mut reader = Reader {
-        system,
-        types,
-        files,
-        of_nodes: vec![None; system.nodes.len()],
-        of_vars: vec![None; system.vars.len()],
-        depth: 0,
-        found: Vec::new(),
-    };
+    let mut reader = Reader::new(system, types, files);
     let text = reader.text(expr).to_string();
     match (reader.of(expr), counted(unit)) {
         (Counts::Rate, Counts::Speed) => Some(
@@ -146,6 +130,11 @@ struct Reader<'a> {
 }
 
 impl<'a> Reader<'a> {
+    fn new(system: &'a System, types: &'a Types, files: &'a Files) -> Reader<'a> {
+        let (of_nodes, of_vars) = (vec![None; system.nodes.len()], vec![None; system.vars.len()]);
+        Reader { system, types, files, of_nodes, of_vars, depth: 0, found: Vec::new() }
+    }
+
     fn text(&self, id: ExprId) -> &'a str {
         self.files.slice(self.system.span(id))
     }
@@ -513,7 +502,7 @@ impl<'a> Reader<'a> {
         })
     }
 
-    /// The argument of `sin`, `cos` or `tan`.
+    /// Reports an argument of `sin`, `cos` or `tan` that is not in rad.
     fn angle_of(&mut self, builtin: Builtin, arg: ExprId) {
         let (name, text) = (builtin.name(), self.text(arg).to_string());
         if let Some(number) = self.bare(arg).filter(|number| number.abs() > TAU && !self.is_expected(arg)) {

@@ -574,9 +574,17 @@ mod tests {
     }
 
     fn fitted(data: &[f64], unknowns: &[Unknown], items: &[Item]) -> Result<Answer, Trouble> {
+        answered(unknowns, items, &|p| (0..data.len()).map(|t| decay(p, t as f64) - data[t]).collect())
+    }
+
+    /// The answer for one compared quantity with these residuals.
+    fn answered(
+        unknowns: &[Unknown],
+        items: &[Item],
+        residuals: &dyn Fn(&[f64]) -> Vec<f64>,
+    ) -> Result<Answer, Trouble> {
         let mut run = |points: &[Vec<f64>]| {
-            let one = |p: &Vec<f64>| Ok(vec![(0..data.len()).map(|t| decay(p, t as f64) - data[t]).collect()]);
-            points.iter().map(one).collect::<Vec<Result<Residuals, String>>>()
+            points.iter().map(|p| Ok(vec![residuals(p)])).collect::<Vec<Result<Residuals, String>>>()
         };
         fit(Question {
             unknowns,
@@ -747,23 +755,9 @@ mod tests {
     fn a_combination_without_data_is_found() {
         let mut chance = Chance(3);
         let noise: Vec<f64> = (0..100).map(|_| 0.01 * normal(&mut chance)).collect();
-        let mut run = |points: &[Vec<f64>]| {
-            let one = |p: &Vec<f64>| Ok(vec![noise.iter().map(|e| p[0] * p[1] - 1.0 - e).collect()]);
-            points.iter().map(one).collect::<Vec<Result<Residuals, String>>>()
-        };
         let unknown = Unknown { low: 0.1, high: 10.0, start: 0.7, known: None };
-        let question = Question {
-            unknowns: &[unknown; 2],
-            items: &[Item { sd: None }],
-            independent: false,
-            run: &mut run,
-            with: PLATFORM,
-            level: 0.95,
-            trials: 100,
-            starts: 1,
-            seed: 0,
-        };
-        let answer = fit(question).unwrap();
+        let residuals = |p: &[f64]| noise.iter().map(|e| p[0] * p[1] - 1.0 - e).collect();
+        let answer = answered(&[unknown; 2], &[Item { sd: None }], &residuals).unwrap();
         assert!((answer.values[0] * answer.values[1] - 1.0).abs() < 0.01, "{answer:?}");
         let [open] = &answer.undetermined[..] else { panic!("{answer:?}") };
         assert!((open.direction[0] + open.direction[1]).abs() < 1e-3, "{open:?}");
