@@ -403,6 +403,10 @@ impl<'t> Source<'t> {
         if self.kind(at) != Some(TokenKind::Word) {
             return false;
         }
+        // `m/%dt` is read as one unit, which `=` must not follow: `dt = v` in it is no statement.
+        if self.glued(at) && self.kind(at - 1) == Some(TokenKind::Unknown) {
+            return false;
+        }
         let (word, fresh) = (self.word(at), self.marks[at].first_on_line);
         let before = self.word(at - 1);
         if before == "." || (before == "rotary" && !fresh) {
