@@ -4,7 +4,7 @@
 //! both at once, and is freed when the last clone of the code is dropped. The code has no symbols, calls nothing except
 //! its own pieces and needs no relocation at run time.
 
-use super::target::{Bytes, FunctionCompiler, here};
+use super::target::{Bytes, FunctionCompiler, here_with};
 use crate::codegen::emit::signature;
 use crate::codegen::executable_memory::{Executable, Memory};
 use crate::codegen::forms::{Context, Form, Options};
@@ -94,7 +94,9 @@ fn distributed(step: &Func, layout: &Layout, pool_len: usize, options: &Options)
             None => Some((None, instants)),
         }
     })?;
-    let bytes = FunctionCompiler::new(here().ok()?).remaining_loop(step, &graph, instants.width()).ok()?;
+    let bytes = FunctionCompiler::new(here_with(options.registers).ok()?)
+        .remaining_loop(step, &graph, instants.width())
+        .ok()?;
     let executable = Executable::new(&bytes.code, bytes.alignment as u64).ok()?;
     // SAFETY: `address` is the start of code with the signature of `RemainingEntry`.
     let entry = unsafe { std::mem::transmute::<*const u8, RemainingEntry>(executable.address()) };
@@ -113,7 +115,7 @@ fn generate(
     options: &Options,
     prepares: bool,
 ) -> Result<(Entries, Option<Prepared>, Memory, Stats), Unsupported> {
-    let isa = here()?;
+    let isa = here_with(options.registers)?;
     let mut memory = Memory::new(isa);
     let module = memory.module();
     let mut compiler = FunctionCompiler::new(isa);

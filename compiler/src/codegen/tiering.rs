@@ -6,6 +6,7 @@
 //! Compare Arnold, Fink, Grove, Hind, Sweeney, *A Survey of Adaptive Optimization in Virtual Machines*, Proc. IEEE,
 //! 2005.
 
+use crate::codegen::forms::{Options, Registers};
 use crate::codegen::lanes::{self, Width};
 use crate::codegen::{jit, target};
 use crate::ir::Func;
@@ -120,7 +121,8 @@ pub fn code(functions: &[(Function, Func)], description: &Description, interpret
 /// Tiered code, for runs that are not in real time: each function is built at its first call and interpreted until it
 /// has run so often that compiling pays. It is then compiled by a thread of its own while the interpreter continues. So
 /// a model makes its first step before anything is compiled, no run waits for code, and functions that run once, such
-/// as the start, are never compiled.
+/// as the start, are never compiled. The adaptive step is compiled twice: first with a register allocation in a single
+/// pass, which takes a third of the time.
 pub fn late(program: &Program, method: Method, interpret: bool) -> (Code, Vec<String>) {
     let size = program.derivatives.ops.len() + program.outputs.ops.len() + program.start.ops.len();
     match target::here() {
@@ -147,31 +149,42 @@ pub fn tiered(program: &Program, method: Method, policy: Policy) -> Code {
 /// Maximum number of operations, before elementary functions are expanded, for which compilation surely succeeds.
 const MAX_TIERED_OPS: usize = 5_000;
 
+/// For each function, in the order of [`Function::ALL`]: the number of runs after which it is compiled; `None`: never.
+/// Attempts at adaptive steps count one by one.
+pub type Thresholds = [Option<u64>; Function::ALL.len()];
+
 /// When the functions of tiered code are compiled. The bits of a run do not depend on it.
 #[derive(Clone, Debug)]
 pub struct Policy {
-    /// For each function, in the order of [`Function::ALL`]: the number of runs after which it is compiled; `None`:
-    /// never. Attempts at adaptive steps count one by one.
-    pub compiled_after: [Option<u64>; Function::ALL.len()],
-    /// Runs of the interpreter within one call, at least 1, before it looks again whether to compile and whether there is
-    /// code.
+    /// With registers allocated in a single pass.
+    pub quickly_after: Thresholds,
+    /// As well as possible.
+    pub compiled_after: Thresholds,
+    /// Runs within one call of the interpreter or of quickly compiled code, at least 1, before it looks again whether to
+    /// compile and whether there is better code.
     pub runs_between_looks: u64,
-    /// Whether a thread of its own compiles, while the interpreter continues; otherwise the next call waits for it.
+    /// Whether a thread of its own compiles, while the run continues; otherwise the next call waits for it.
     pub in_background: bool,
 }
 
 impl Policy {
     /// Everything is interpreted.
-    pub const NEVER: Policy =
-        Policy { compiled_after: [None; Function::ALL.len()], runs_between_looks: u64::MAX, in_background: false };
+    pub const NEVER: Policy = Policy {
+        quickly_after: [None; Function::ALL.len()],
+        compiled_after: [None; Function::ALL.len()],
+        runs_between_looks: u64::MAX,
+        in_background: false,
+    };
 
-    /// Compiles when the runs so far have taken nearly as long as compiling takes: interpreting an operation takes some
-    /// 2 ns, compiling it some 2 µs. An adaptive step takes some 13 ms, because the time of register allocation grows
-    /// faster than the length, and 2.2 µs to interpret.
+    /// Compiles when the runs so far have lost nearly as much as compiling takes: interpreting an operation takes some
+    /// 2 ns, compiling it some 2 µs. Compiling an adaptive step takes some 12 ms, because the time of backtracking
+    /// register allocation grows faster than the length, and 4 ms with a single pass. An attempt then takes some 2.7 µs
+    /// interpreted, 1.5 µs by the quick code and 0.9 µs by the better one.
     pub const USUAL: Policy = {
-        let mut compiled_after = [Some(800); Function::ALL.len()];
-        compiled_after[Function::Rosenbrock as usize] = Some(5000);
-        Policy { compiled_after, runs_between_looks: 64, in_background: true }
+        let (mut quickly_after, mut compiled_after) = ([None; Function::ALL.len()], [Some(800); Function::ALL.len()]);
+        quickly_after[Function::Rosenbrock as usize] = Some(400);
+        compiled_after[Function::Rosenbrock as usize] = Some(15_000);
+        Policy { quickly_after, compiled_after, runs_between_looks: 64, in_background: true }
     };
 }
 
@@ -191,12 +204,26 @@ struct Functions {
 struct Forms {
     func: OnceLock<Option<(Function, Func)>>,
     interpreter: OnceLock<Interpreter>,
-    /// Machine code; the inner `None` means that the function is too large.
+    quick: Compiled,
+    best: Compiled,
+    /// Number of iterations run so far.
+    runs: AtomicU64,
+}
+
+/// A form of machine code.
+#[derive(Default)]
+struct Compiled {
+    /// The inner `None` means that the function is too large.
     machine: OnceLock<Option<Machine>>,
     /// Whether somebody compiles it or has done so.
     is_claimed: AtomicBool,
-    /// Number of iterations run so far.
-    runs: AtomicU64,
+}
+
+impl Compiled {
+    /// The code, if it has been compiled and the function is not too large.
+    fn machine(&self) -> Option<&Machine> {
+        self.machine.get()?.as_ref()
+    }
 }
 
 impl Functions {
@@ -218,30 +245,49 @@ impl Functions {
         back_end(std::slice::from_ref(func), &self.program.description.layout, self.program.description.pool.len())
     }
 
-    /// Machine code of a function, if it has been compiled and is not too large for that.
-    fn machine(&self, which: Function) -> Option<&Machine> {
-        self.forms[which as usize].machine.get()?.as_ref()
+    /// The better machine code of a function, if it has been compiled and is not too large for that.
+    fn best(&self, which: Function) -> Option<&Machine> {
+        self.forms[which as usize].best.machine()
     }
 
-    fn compile(&self, which: Function) {
-        let make = |funcs: &[_], layout: &Layout, pool| jit::compile_prepared(funcs, layout, pool).ok().map(|it| it.0);
-        self.forms[which as usize].machine.get_or_init(|| self.make(which, make));
+    /// Machine code of the form that goes with a way to allocate registers.
+    fn compiled(&self, which: Function, registers: Registers) -> &Compiled {
+        let forms = &self.forms[which as usize];
+        match registers {
+            Registers::SinglePass => &forms.quick,
+            Registers::Backtracking => &forms.best,
+        }
+    }
+
+    fn compile(&self, which: Function, registers: Registers) {
+        let options = Options { registers, ..Options::default() };
+        // Quick code shares its calls with the interpreter, which makes no single steps with hoisted values.
+        let prepares = registers == Registers::Backtracking;
+        let make = |funcs: &[_], layout: &Layout, pool| {
+            jit::compile_with(funcs, layout, pool, &options, prepares).ok().map(|(machine, _)| machine)
+        };
+        self.compiled(which, registers).machine.get_or_init(|| self.make(which, make));
     }
 }
 
 impl Tiered {
     /// Compiles a function if that pays by now and nobody has begun to.
     fn consider(&self, which: Function) {
-        let forms = &self.0.forms[which as usize];
-        let Some(after) = self.0.policy.compiled_after[which as usize] else { return };
-        if forms.runs.load(Ordering::Relaxed) < after || forms.is_claimed.swap(true, Ordering::Relaxed) {
+        let (runs, policy) = (self.0.forms[which as usize].runs.load(Ordering::Relaxed), &self.0.policy);
+        let pays = |thresholds: &Thresholds| thresholds[which as usize].is_some_and(|after| runs >= after);
+        let registers = match (pays(&policy.compiled_after), pays(&policy.quickly_after)) {
+            (true, _) => Registers::Backtracking,
+            (false, true) => Registers::SinglePass,
+            (false, false) => return,
+        };
+        if self.0.compiled(which, registers).is_claimed.swap(true, Ordering::Relaxed) {
             return;
         }
         let functions = self.0.clone();
-        let background = || Builder::new().name("compiler".into()).spawn(move || functions.compile(which));
+        let background = || Builder::new().name("compiler".into()).spawn(move || functions.compile(which, registers));
         // Where no thread can be had, the caller compiles.
-        if !self.0.policy.in_background || background().is_err() {
-            self.0.compile(which);
+        if !policy.in_background || background().is_err() {
+            self.0.compile(which, registers);
         }
     }
 }
@@ -252,18 +298,23 @@ impl Interpret for Tiered {
         let settled = |block: &[f64]| self.0.settled(which, block);
         let mut left = count;
         loop {
-            if forms.machine.get().is_none() {
+            if forms.best.machine.get().is_none() {
                 self.consider(which);
             }
             // Machine code for a single step may leave the count to the caller, who stores it only after a single step.
-            let keeps_count = which != Function::Step || left > 1 || count == 1;
-            if let Some(machine) = self.0.machine(which).filter(|_| keeps_count) {
+            let keeps_count = |runs| which != Function::Step || runs > 1 || count == 1;
+            if let Some(machine) = forms.best.machine().filter(|_| keeps_count(left)) {
                 return machine.call(which, block, pool, left);
             }
             let runs = left.min(self.0.policy.runs_between_looks);
             let before = settled(block);
-            let interpreter = forms.interpreter.get_or_init(|| self.0.make(which, Interpreter::new));
-            let status = interpreter.call(which, block, pool, runs);
+            let status = match forms.quick.machine().filter(|_| keeps_count(runs)) {
+                Some(machine) => machine.call(which, block, pool, runs),
+                None => {
+                    let interpreter = forms.interpreter.get_or_init(|| self.0.make(which, Interpreter::new));
+                    interpreter.call(which, block, pool, runs)
+                }
+            };
             // A call for adaptive steps ends at the first step that it leaves open, most often long before `count`.
             let done = if which == Function::Rosenbrock { 1 + settled(block).saturating_sub(before) } else { runs };
             forms.runs.fetch_add(done, Ordering::Relaxed);
@@ -275,7 +326,7 @@ impl Interpret for Tiered {
     }
 
     fn made(&self, which: Function) -> Option<&Machine> {
-        self.0.machine(which)
+        self.0.best(which)
     }
 
     fn has(&self, which: Function) -> bool {
