@@ -1,5 +1,5 @@
 //! Measures against their definitions, over random experiments with printed seeds: `slope` against the difference of
-//! the quantity, `count` and `duration` against a count over the recording, peaks and crossings against the closed form
+//! the quantity, what is recorded with and without a measure, `count` and `duration` against a count over the recording, peaks and crossings against the closed form
 //! of damped oscillations. `FRIC_SEED`, `FRIC_RUNS` (default 60).
 
 mod support;
@@ -47,6 +47,59 @@ fn expression(random: &mut Random, depth: u32) -> String {
         18 => format!("hypot({a}, 1 + ({b})^2)"),
         _ => format!("atan({a})"),
     }
+}
+
+/// A measure that needs more points than a plot changes neither the number nor the course of the rows recorded.
+///
+/// Mutants tried by hand: every point is recorded (fails in case 0 of seed 1); a plot gets no points below the first
+/// bisection (case 41).
+#[test]
+fn what_is_recorded_does_not_depend_on_what_is_measured() {
+    let (seed, runs) = (of_environment("FRIC_SEED", 1), of_environment("FRIC_RUNS", 60));
+    let mut random = Random(seed);
+    let (mut finer, mut case) = (0, 0);
+    while case < runs {
+        let f = expression(&mut random, 1 + case as u32 % 3);
+        let text = |measure: &str| {
+            format!(
+                "model Inner {{
+  param p = 0.7
+  state x = 0.2
+  state y = 1
+  dx/dt = y / 1 s
+  dy/dt = (-x - 0.1 * y + p * sin(t / 1 s)) / 1 s
+  output both = x * y + p
+}}
+model Whole {{ part m = Inner() }}
+experiment e {{
+  run Whole() for 20 s
+  plot m.x, {f}
+  {measure}
+}}
+"
+            )
+        };
+        let (Ok(bare), Ok(measured)) = (ran(&text("")), ran(&text("show period(m.x)"))) else { continue };
+        let at = format!("FRIC_SEED={seed} case {case}: {f}");
+        let [bare, measured] = [bare.recording, measured.recording];
+        let (few, many) = (bare.rows().len() as f64, measured.rows().len() as f64);
+        assert!(many <= 1.1 * few + 8.0 && few <= 1.1 * many + 8.0, "{at}: {few} rows, and {many}");
+        assert_eq!(measured.seen(), measured.rows().len() as u64, "{at}");
+        for column in 0..2 {
+            let points: Vec<(f64, f64)> = measured.points(column).collect();
+            let (low, high) =
+                points.iter().fold((f64::MAX, f64::MIN), |(low, high), (_, y)| (low.min(*y), high.max(*y)));
+            for (t, y) in bare.points(column) {
+                let after = points.partition_point(|point| point.0 < t).clamp(1, points.len() - 1);
+                let ((t0, y0), (t1, y1)) = (points[after - 1], points[after]);
+                let straight = if t1 > t0 { y0 + (y1 - y0) * ((t - t0) / (t1 - t0)).clamp(0.0, 1.0) } else { y1 };
+                assert!((y - straight).abs() <= 4e-3 * (high - low) + 1e-9, "{at}: {y} at {t} s, not {straight}");
+            }
+        }
+        finer += u64::from(few > 1100.0);
+        case += 1;
+    }
+    assert!(finer > 0 || runs < 60, "no case needs more rows than the least number");
 }
 
 /// ∫ slope(f) dt = f(end) − f(start).

@@ -1,7 +1,7 @@
 //! Recordings of a run for plots and files, in bounded memory.
 //!
-//! In: the points of a run in order of time. Out: a [`Recording`]: rows of time and values that include every minimum
-//! and maximum of every column, at least 1,000 rows if the run had that many. Measures do not read it.
+//! In: the points of a run in order of time. Out: a [`Recording`]: a row of time and values for each of 16,384 points;
+//! of more points, rows that include every minimum and maximum of every column, at least 1,000. Measures do not read it.
 
 pub mod blocks;
 pub mod claim;
@@ -13,6 +13,9 @@ pub mod log;
 use abi::Slot;
 use abi::plan::{Plot, Series};
 use abi::unit::Unit;
+
+/// So many points are kept as they are; more of them in buckets.
+const WHOLE: usize = 16_384;
 
 /// Largest number of buckets. When they are full, neighbours are merged, so at least half of them hold a row or more.
 const BUCKETS: usize = 4096;
@@ -72,13 +75,15 @@ impl Column {
 
 /// Builds a recording.
 ///
-/// Points are gathered in buckets of 1, 2, 4, … consecutive points. A bucket keeps whole rows: its first, and for each
-/// column those with the least and the greatest value. The rows are whole so that a plot of one quantity against
+/// A long run's points are gathered in buckets of 1, 2, 4, … consecutive points. A bucket keeps whole rows: its first, and
+/// for each column those with the least and the greatest value. The rows are whole so that a plot of one quantity against
 /// another shows points that occurred. When all buckets are full, neighbours are merged in pairs: the extremes of both
 /// are among their rows.
 pub struct Recorder {
     columns: Vec<Column>,
     slots: Vec<Slot>,
+    /// The rows of all points, as in a [`Recording`]; empty once there are buckets.
+    whole: Vec<f64>,
     /// Buckets one after the other, each of 2 · columns + 1 rows, some of which may be equal. A row is the number of
     /// its point, its time, and the columns.
     buckets: Vec<f64>,
@@ -89,8 +94,8 @@ pub struct Recorder {
     seen: u64,
     /// The last row, which ends the recording.
     last: Vec<f64>,
-    /// For a recording of every point: its rows, and the most numbers that it may hold.
-    every: Option<(Vec<f64>, usize)>,
+    /// For a recording of every point: the most numbers that it may hold.
+    most: Option<usize>,
     /// Points outside are not kept, in s: no plot shows them.
     window: (f64, f64),
 }
@@ -115,17 +120,18 @@ impl Recorder {
             [] => (after.fold(f64::INFINITY, f64::min), before.fold(f64::NEG_INFINITY, f64::max)),
             _ => (f64::NEG_INFINITY, f64::INFINITY),
         };
-        Recorder { columns, slots, buckets: Vec::new(), capacity: 1, filled: 1, seen: 0, last, every: None, window }
+        let (whole, buckets) = (Vec::new(), Vec::new());
+        Recorder { columns, slots, whole, buckets, capacity: 1, filled: 1, seen: 0, last, most: None, window }
     }
 
     /// The same, and keeps every point of the run, as long as these are at most `most` numbers.
     pub fn whole(plots: &[Plot], records: &[Series], most: usize) -> Recorder {
-        Recorder { every: Some((Vec::new(), most)), ..Recorder::new(plots, records) }
+        Recorder { most: Some(most), ..Recorder::new(plots, records) }
     }
 
     /// The recording of every point; `None` if it would have been too large.
     pub fn all(self) -> Option<Recording> {
-        let (numbers, most) = self.every?;
+        let (numbers, most) = (self.whole, self.most?);
         (numbers.len() <= most).then_some(Recording { columns: self.columns, numbers, seen: self.seen })
     }
 
@@ -159,38 +165,51 @@ impl Recorder {
             *value = block[slot.index()];
         }
         self.seen += 1;
-        if let Some((numbers, most)) = &mut self.every {
-            if numbers.len() <= *most {
-                numbers.extend(&self.last[1..]);
+        if let Some(most) = self.most {
+            if self.whole.len() <= most {
+                self.whole.extend(&self.last[1..]);
             }
             return;
         }
         if !(t >= self.window.0 && t <= self.window.1) {
             return;
         }
+        if self.buckets.is_empty() {
+            if self.whole.len() < WHOLE * (self.slots.len() + 1) {
+                self.whole.extend(&self.last[1..]);
+                return;
+            }
+            let whole = std::mem::take(&mut self.whole);
+            for (number, row) in whole.chunks_exact(self.slots.len() + 1).enumerate() {
+                let row: Vec<f64> = std::iter::once(number as f64).chain(row.iter().copied()).collect();
+                self.gather(&row);
+            }
+        }
+        let last = std::mem::take(&mut self.last);
+        self.gather(&last);
+        self.last = last;
+    }
+
+    /// Adds a point to the last bucket, or to a new one.
+    fn gather(&mut self, row: &[f64]) {
+        let len = (2 * self.slots.len() + 1) * row.len();
         if self.filled < self.capacity {
             self.filled += 1;
-            let bucket = self.buckets.len() - self.bucket_len();
-            take(&mut self.buckets[bucket..], &self.last);
+            let bucket = self.buckets.len() - len;
+            take(&mut self.buckets[bucket..], row);
             return;
         }
-        if self.buckets.len() == BUCKETS * self.bucket_len() {
-            self.join();
+        if self.buckets.len() == BUCKETS * len {
+            self.join(len, row.len());
         }
         self.filled = 1;
         for _ in 0..2 * self.slots.len() + 1 {
-            self.buckets.extend_from_slice(&self.last);
+            self.buckets.extend_from_slice(row);
         }
     }
 
-    /// Length of a bucket in numbers.
-    fn bucket_len(&self) -> usize {
-        (2 * self.slots.len() + 1) * self.last.len()
-    }
-
-    /// Merges neighbouring buckets in pairs.
-    fn join(&mut self) {
-        let (len, width) = (self.bucket_len(), self.last.len());
+    /// Merges neighbouring buckets in pairs. `len`: that of a bucket; `width`: that of one of its rows.
+    fn join(&mut self, len: usize, width: usize) {
         for pair in 0..BUCKETS / 2 {
             self.buckets.copy_within(2 * pair * len..(2 * pair + 1) * len, pair * len);
             let (joined, rest) = self.buckets.split_at_mut((2 * pair + 1) * len);
@@ -204,11 +223,11 @@ impl Recorder {
 
     /// The recording so far.
     pub fn recording(&self) -> Recording {
-        let mut numbers = Vec::new();
-        let mut rows: Vec<&[f64]> = Vec::new();
-        for bucket in self.buckets.chunks_exact(self.bucket_len()) {
+        let mut numbers = self.whole.clone();
+        let (mut rows, width): (Vec<&[f64]>, usize) = (Vec::new(), self.last.len());
+        for bucket in self.buckets.chunks_exact((2 * self.slots.len() + 1) * width) {
             rows.clear();
-            rows.extend(bucket.chunks_exact(self.last.len()));
+            rows.extend(bucket.chunks_exact(width));
             rows.sort_by(|a, b| a[0].total_cmp(&b[0]));
             rows.dedup_by_key(|row| row[0]);
             numbers.extend(rows.iter().flat_map(|row| &row[1..]));
@@ -265,8 +284,8 @@ mod tests {
 
     #[test]
     fn few_points_are_kept_whole() {
-        let recording = record(1000, |n| (n.sin(), n.cos()));
-        assert_eq!(recording.rows().len(), 1000);
+        let recording = record(WHOLE as u64, |n| (n.sin(), n.cos()));
+        assert_eq!(recording.rows().len(), WHOLE);
         assert_eq!(recording.columns().len(), 2);
         assert_eq!(recording.points(1).nth(7), Some((7.0, 7f64.cos())));
     }

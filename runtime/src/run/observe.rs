@@ -90,14 +90,16 @@ impl Observer {
         if doubt != 0.0 {
             self.check(instance)?;
         }
-        self.show(block[Slot::TIME.index()], block);
+        self.show(block[Slot::TIME.index()], block, true);
         Ok(())
     }
 
-    /// Adds a point whose values are known to be finite.
-    pub(crate) fn show(&mut self, time: f64, block: &[f64]) {
+    /// Adds a point whose values are known to be finite. `for_all`: not only for the measures.
+    pub(crate) fn show(&mut self, time: f64, block: &[f64], for_all: bool) {
         self.expectations.see(time, block);
-        self.recorder.see(time, block);
+        if for_all {
+            self.recorder.see(time, block);
+        }
     }
 
     /// Names the observed value that is not finite. States come first, because a bad state explains a bad expression.

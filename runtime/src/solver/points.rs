@@ -1,6 +1,7 @@
 //! Selects the points of an adaptive run to show: the ends of its steps, both sides of events, the edges of windows,
 //! and as many points in between as linear interpolation needs; also each turning point of a quantity, so that no
-//! extreme is missed. Integrals between points are taken from the dense output.
+//! extreme is missed. Measures may need more points between them than a plot does, which are not recorded. Integrals
+//! between points are taken from the dense output.
 //!
 //! In: accepted steps in order. Out: points and integrals, passed to an [`Observer`]. Evaluates outputs only if they
 //! are observed, and never changes a step.
@@ -20,6 +21,9 @@ const DEPTH: usize = 8;
 
 /// Most bisections of an interval over which an integral is taken.
 const MOST_HALVED: usize = 8;
+
+/// Allowed error of linear interpolation in plots, as a fraction of the span: no more resolution than their pixels.
+const BEND: f64 = 1e-3;
 
 /// Allowed error of an integral, as a fraction of the tolerance.
 const OF_TOLERANCE: f64 = 0.01;
@@ -76,7 +80,8 @@ pub(crate) struct Points {
     rows: Vec<f64>,
     /// Least and greatest value of each slot.
     spans: Vec<(f64, f64)>,
-    /// Allowed error of linear interpolation between two points, as a fraction of the span.
+    /// Allowed error of linear interpolation between two points for measures, as a fraction of the span; at most
+    /// [`BEND`].
     bend: f64,
     /// θ and column of each turning point between two points.
     turns: Vec<(f64, usize)>,
@@ -121,9 +126,9 @@ impl Points {
             part: (0.0, 0.0),
             rows: vec![0.0; slots.len() * (DEPTH + 4)],
             spans: vec![(f64::INFINITY, f64::NEG_INFINITY); slots.len()],
-            // A plot needs no more resolution than its pixels. Periods and the like use cubics through points, whose
-            // error is about the square of that of lines; integrals and extremes have their own error control.
-            bend: if lines { (1e-2 * tol.sqrt()).min(1e-5) } else { 1e-3 },
+            // Periods and the like use cubics through points, whose error is about the square of that of lines; integrals
+            // and extremes have their own error control.
+            bend: if lines { (1e-2 * tol.sqrt()).min(1e-5) } else { BEND },
             turns: Vec::new(),
             block: instance.block().to_vec(),
             x: vec![0.0; instance.description().layout.states.len as usize],
@@ -144,7 +149,7 @@ impl Points {
         }
         system.place(t, x);
         self.sample_block(system, 0)?;
-        self.emit(0, t);
+        self.emit(0, t, true);
         Ok(())
     }
 
@@ -213,8 +218,8 @@ impl Points {
             let last = f64::from(piece) == pieces;
             let end = if last { theta } else { from + (theta - from) * f64::from(piece) / pieces };
             self.sample(system, step, 1, end)?;
-            self.between(system, step, (start, 0), (end, 1), DEPTH)?;
-            self.emit(1, if last { time } else { step.time(end) });
+            self.between(system, step, (start, 0), (end, 1), (DEPTH, true))?;
+            self.emit(1, if last { time } else { step.time(end) }, true);
             let width = self.slots.len();
             self.rows.copy_within(width..2 * width, 0);
             self.theta = end;
@@ -296,32 +301,35 @@ impl Points {
             return Ok(());
         }
         self.sample(system, step, 0, theta)?;
-        self.emit(0, time);
+        self.emit(0, time, true);
         self.theta = theta;
         Ok(())
     }
 
-    /// Shows points between two rows until linear interpolation is accurate enough; and each turning point.
+    /// Shows points between two rows until linear interpolation is accurate enough; and each turning point. `for_all`:
+    /// whether the point in the middle is shown not only to measures.
     fn between(
         &mut self,
         system: &mut System,
         step: &Step,
         (from, row_from): (f64, usize),
         (to, row_to): (f64, usize),
-        depth: usize,
+        (depth, for_all): (usize, bool),
     ) -> Result<(), Stop> {
         let middle = 0.5 * (from + to);
         let row = DEPTH + 2 - depth;
         self.sample(system, step, row, middle)?;
         let width = self.slots.len();
-        let mut straight = true;
+        let (mut straight, mut looks_straight) = (true, true);
         self.turns.clear();
         for i in 0..width {
             let [a, m, b] = [row_from, row, row_to].map(|row| self.rows[row * width + i]);
             let (low, high) = self.spans[i];
             let span = high.max(b) - low.min(b);
             let bend = a - 2.0 * m + b;
-            straight &= 0.5 * bend.abs() <= self.bend * span + 1e-15 * m.abs();
+            let is_within = |part: f64| 0.5 * bend.abs() <= part * span + 1e-15 * m.abs();
+            straight &= is_within(self.bend);
+            looks_straight &= is_within(BEND);
             // On the parabola through the three points, with −1 at a and 1 at b.
             let turn = 0.5 * (a - b) / bend;
             let beyond = 0.25 * (b - a) * turn;
@@ -330,10 +338,11 @@ impl Points {
             }
         }
         if !straight && depth > 1 {
-            self.between(system, step, (from, row_from), (middle, row), depth - 1)?;
+            let halves = (depth - 1, for_all && !looks_straight);
+            self.between(system, step, (from, row_from), (middle, row), halves)?;
             // The right half needs only the rows below this one.
-            self.emit(row, step.time(middle));
-            return self.between(system, step, (middle, row), (to, row_to), depth - 1);
+            self.emit(row, step.time(middle), for_all);
+            return self.between(system, step, (middle, row), (to, row_to), halves);
         }
         for k in 0..self.turns.len() {
             let (turn, column) = self.turns[k];
@@ -345,14 +354,14 @@ impl Points {
         let early = self.turns.partition_point(|(turn, _)| *turn < middle);
         for i in 0..self.turns.len() {
             if i == early {
-                self.emit(row, step.time(middle));
+                self.emit(row, step.time(middle), for_all);
             }
             let (turn, _) = self.turns[i];
             self.sample(system, step, row + 1, turn)?;
-            self.emit(row + 1, step.time(turn));
+            self.emit(row + 1, step.time(turn), true);
         }
         if early == self.turns.len() {
-            self.emit(row, step.time(middle));
+            self.emit(row, step.time(middle), for_all);
         }
         Ok(())
     }
@@ -415,13 +424,13 @@ impl Points {
         if doubt != 0.0 { self.observer.check(&system.instance) } else { Ok(()) }
     }
 
-    fn emit(&mut self, row: usize, time: f64) {
+    fn emit(&mut self, row: usize, time: f64, for_all: bool) {
         let width = self.slots.len();
         let values = &self.rows[row * width..(row + 1) * width];
         for ((value, slot), span) in values.iter().zip(&self.slots).zip(&mut self.spans) {
             self.block[*slot] = *value;
             *span = (span.0.min(*value), span.1.max(*value));
         }
-        self.observer.show(time, &self.block);
+        self.observer.show(time, &self.block, for_all);
     }
 }
