@@ -310,6 +310,19 @@ fn division(reach: &mut Reach, types: &Types, files: &Files, divisor: ExprId) ->
         (_, true) if signed.low < 0.0 => format!("min({text}, -0.001{unit})"),
         _ => format!("max({text}, 0.001{unit})"),
     };
+    if let Some((upper, lower)) = interpolated(system, factor) {
+        let lower_var = system.var(lower);
+        let range = match lower_var.range_span {
+            Some(_) => String::new(),
+            None => format!(" and declare `{} in > 0`", declaration(system, files, lower_var)),
+        };
+        return error.help(format!(
+            "if `{upper}` is never below `{lower}`, write `require {upper} >= {lower}`{range}; or keep it away from 0, for \
+             example `{bounded}`",
+            upper = system.var(upper).name,
+            lower = lower_var.name
+        ));
+    }
     let named = matches!(system.node(factor), Node::Var(_));
     error.help(match named && !(signed.low >= 0.0 || signed.high <= 0.0) {
         // A quantity of both signs has no bound on one side.
@@ -320,6 +333,35 @@ fn division(reach: &mut Reach, types: &Types, files: &Files, divisor: ExprId) ->
 
 const VELOCITY: Dimension = Dimension::of([0, 1, -1, 0, 0]);
 const ANGULAR_VELOCITY: Dimension = Dimension::of([0, 0, -1, 0, 0]);
+
+/// The parameters of `Fc + (Fs - Fc) * w`, upper and lower: such a value lies between them, if it is known which is larger.
+fn interpolated(system: &System, sum: ExprId) -> Option<(VarId, VarId)> {
+    let var = |id: ExprId| match *system.node(id) {
+        Node::Var(id) if system.var(id).kind == VarKind::Param => Some(id),
+        _ => None,
+    };
+    let Node::Binary(BinaryOp::Add, a, b) = *system.node(sum) else { return None };
+    let (lower, mut rest) = match (var(a), var(b)) {
+        (Some(lower), _) => (lower, b),
+        (None, Some(lower)) => (lower, a),
+        (None, None) => return None,
+    };
+    let difference = |id: ExprId| match *system.node(id) {
+        Node::Binary(BinaryOp::Subtract, upper, own) if var(own) == Some(lower) => var(upper),
+        _ => None,
+    };
+    for _ in 0..16 {
+        if let Some(upper) = difference(rest) {
+            return Some((upper, lower));
+        }
+        let Node::Binary(BinaryOp::Multiply, x, y) = *system.node(rest) else { return None };
+        if let Some(upper) = difference(y) {
+            return Some((upper, lower));
+        }
+        rest = x;
+    }
+    None
+}
 
 /// The factor of a divisor that can be zero: the divisor itself unless it is a product, a power or a name for one.
 fn vanishing_factor(reach: &mut Reach, divisor: ExprId) -> ExprId {

@@ -95,11 +95,15 @@ impl Loaded {
         if let Some(item) = scope.own(space, name) {
             return Lookup::Found(item, self.item(item));
         }
-        let mut imported = scope.imported.iter().filter_map(|from| self.scopes[from.0 as usize].own(space, name));
-        match (imported.next(), imported.next()) {
-            (None, _) => Lookup::Missing,
-            (Some(item), None) => Lookup::Found(item, self.item(item)),
-            (Some(a), Some(b)) => Lookup::Ambiguous(a, b),
+        let imported = || scope.imported.iter().filter_map(|from| self.scopes[from.0 as usize].own(space, name));
+        // What a user's file declares hides what the library has, as in the file itself.
+        let mut nearest = imported().filter(|item| !self.files.get(item.file).library);
+        let (own, other) = (nearest.next(), nearest.next());
+        let mut all = imported();
+        match (own, other, all.next(), all.next()) {
+            (Some(item), None, ..) | (None, _, Some(item), None) => Lookup::Found(item, self.item(item)),
+            (Some(a), Some(b), ..) | (None, _, Some(a), Some(b)) => Lookup::Ambiguous(a, b),
+            (None, _, None, _) => Lookup::Missing,
         }
     }
 
