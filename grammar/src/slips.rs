@@ -487,7 +487,12 @@ fn foreign_statement(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagn
     }
     // `assert(max(F) < 2)`
     if word == "assert" && next == "(" {
-        let help = "in an experiment write `expect max(F) < 2 N`, in a model `require Fs >= Fc, \"why\"`";
+        let close =
+            (first + 2..piece.end).rev().find(|&mark| source.is_symbol(mark, ")")).filter(|&close| close > first + 2);
+        let inner = close.map_or("max(F) < 2 N", |close| slice(source, first + 2, close - 1));
+        // A measure is of an experiment alone.
+        let also = if inner.contains('(') { String::new() } else { format!(", in a model `require {inner}, \"why\"`") };
+        let help = format!("in an experiment write `expect {inner}`{also}; numbers carry their unit: `2 N`");
         return Some(error("what must hold is an `expect`", first).help(help));
     }
     // `parameter Real k = 2`
@@ -503,7 +508,22 @@ fn foreign_statement(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagn
     let (_, message, help) = FOREIGN.iter().find(|(words, ..)| words.contains(&word))?;
     let block =
         matches!(word, "while" | "for" | "foreach" | "loop" | "repeat" | "do" | "switch" | "case" | "otherwise");
-    let error = error(message, first).help(*help);
+    let inner = (source.is_symbol(first + 1, "(") && matches!(word, "disp" | "print" | "display"))
+        .then(|| (first + 2..piece.end).rev().find(|&mark| source.is_symbol(mark, ")")))
+        .flatten()
+        .filter(|&close| close > first + 2)
+        .map(|close| slice(source, first + 2, close - 1));
+    let help = match (word, inner) {
+        (_, Some(inner)) if is_short(inner) => format!("write `show {inner}`; its value is printed after the run"),
+        ("while", _) => match choice(source, first).filter(|help| is_short(help)) {
+            Some(written) => format!(
+                "an equation that holds under a condition is a choice: `{written}`;\nregimes that remember are `mode`s"
+            ),
+            None => help.to_string(),
+        },
+        _ => help.to_string(),
+    };
+    let error = error(message, first).help(help);
     Some(if block { error.about_word(WordMistake::Block) } else { error })
 }
 
@@ -549,8 +569,17 @@ fn borrowed(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
     }
     // `1:1:10`
     if begin == "sweep" && source.word(at) == ":" {
-        let help = "write `1 mm .. 10 mm by 1 mm`, with the unit at each number; `lin 5` and `log 5` give five values";
-        return error("a range of values is written with `..`", at, at, help.into());
+        let number = |at: usize| (source.kind(at) == Some(TokenKind::Number)).then(|| source.word(at));
+        let third = source.is_symbol(at + 2, ":").then(|| number(at + 3)).flatten();
+        let written = match (number(at - 1), number(at + 1), third) {
+            (Some(from), Some(step), Some(to)) => format!("{from} .. {to} by {step}"),
+            (Some(from), Some(to), None) => format!("{from} .. {to} by 1"),
+            _ => "1 .. 10 by 1".into(),
+        };
+        let help = format!(
+            "write `{written}`, with the unit at each number as in `1 mm .. 10 mm by 1 mm`;\n`lin 5` and `log 5` in place of `by` give five values"
+        );
+        return error("a range of values is written with `..`", at, at, help);
     }
     // `g = @(v) Fc * sign(v)`
     let at_sign = (first..piece.end.min(at + 2)).find(|&mark| source.word(mark) == "@");
@@ -558,7 +587,11 @@ fn borrowed(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
         let close = (handle..piece.end).find(|&mark| source.is_symbol(mark, ")"))?;
         let name = if source.is_symbol(first + 1, "=") { begin } else { "g" };
         let args = slice(source, handle + 1, close);
-        let help = format!("declare it outside of models, with the units of its arguments: `fn {name}{args} = ...`");
+        let body = if close + 1 < piece.end { slice(source, close + 1, piece.end - 1) } else { "..." };
+        let body = if is_short(body) { body } else { "..." };
+        let help = format!(
+            "write it outside of models, with the unit of each argument, as in `v [m/s]`: `fn {name}{args} = {body}`;\nit sees its arguments and what is `const`"
+        );
         return error("a function has a name and is declared by `fn`", handle, close, help);
     }
     // `[t, y] = ode45(...)`
@@ -643,7 +676,18 @@ fn habit(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
         return Some(error(&message, at, at).help("write `else if`"));
     }
     if here == "?" {
-        let help = "write `if condition then a else b`";
+        let from = (first..at).find(|&mark| source.is_symbol(mark, "=")).map_or(first, |sign| sign + 1);
+        let colon = (at + 1..piece.end).find(|&mark| source.is_symbol(mark, ":"));
+        let parts = colon.filter(|&colon| from < at && at + 1 < colon && colon + 1 < piece.end).map(|colon| {
+            let part = |first: usize, last: usize| slice(source, first, last);
+            format!(
+                "write `if {} then {} else {}`",
+                part(from, at - 1),
+                part(at + 1, colon - 1),
+                part(colon + 1, piece.end - 1)
+            )
+        });
+        let help = parts.filter(|help| is_short(help)).unwrap_or("write `if condition then a else b`".into());
         return Some(error("a choice is written in words", at, at).help(help));
     }
     if matches!(here, "for" | "while" | "foreach" | "loop" | "repeat") && source.marks[at].first_on_line {
@@ -813,17 +857,63 @@ fn branching(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
         && matches!(source.word(stop.at), "else" | "elseif" | "end" | "endif" | "endfunction");
     let first = if ends { stop.at } else { piece.start };
     let (mistake, message, help) = match source.word(first) {
-        "if" | "else" | "elseif" => (
-            WordMistake::Block,
-            "a choice is a value, not a statement: every equation holds at all times",
-            "write `F = if v > 0 then a else b`; states that switch are a `mode`",
-        ),
+        "if" | "else" | "elseif" => {
+            let written = choice(source, first).filter(|help| is_short(help));
+            (
+                WordMistake::Block,
+                "a choice is a value, not a statement: every equation holds at all times",
+                format!(
+                    "write `{}`; states that switch are a `mode`",
+                    written.unwrap_or("F = if v > 0 m/s then a else b".into())
+                ),
+            )
+        }
         "end" | "endif" | "endfunction" if first + 1 >= piece.end || ends || source.marks[first + 1].first_on_line => {
-            (WordMistake::BlockEnd, "a block ends with `}`", "remove it, or write `}`")
+            (WordMistake::BlockEnd, "a block ends with `}`", "remove it, or write `}`".into())
         }
         _ => return None,
     };
     Some(Diagnostic::error("E0001", message).label(source.span(first), "").help(help).about_word(mistake))
+}
+
+/// The last mark of the line on which a mark stands.
+fn line_end(source: &Source, at: usize) -> usize {
+    (at + 1..source.marks.len()).find(|&mark| source.marks[mark].first_on_line).unwrap_or(source.marks.len()) - 1
+}
+
+/// `NAME = VALUE` on the line of a mark.
+fn assignment<'t>(source: &Source<'t>, at: usize) -> Option<(&'t str, &'t str)> {
+    let end = line_end(source, at);
+    let sign = (at..end).find(|&mark| source.is_symbol(mark, "="))?;
+    let value_end = if source.word(end) == ";" { end - 1 } else { end };
+    (sign > at && value_end > sign).then(|| (slice(source, at, sign - 1), slice(source, sign + 1, value_end)))
+}
+
+/// The choice that a statement `if`, or a loop `while`, with one equation in each branch means: `let F = if v > 0 m/s then
+/// Fc else -Fc`.
+fn choice(source: &Source, first: usize) -> Option<String> {
+    let end = line_end(source, first);
+    if !matches!(source.word(first), "if" | "while") || end <= first {
+        return None;
+    }
+    let condition = slice(source, first + 1, end).trim_end_matches(',');
+    let Some((name, yes)) = (end + 1 < source.marks.len()).then(|| assignment(source, end + 1)).flatten() else {
+        return Some(format!("F = if {condition} then a else b"));
+    };
+    let is_declared = (1..source.marks.len())
+        .any(|mark| source.word(mark) == name && matches!(source.word(mark - 1), "let" | "output"));
+    let declared = if name.contains('/') || is_declared { "" } else { "let " };
+    let after = line_end(source, end + 1) + 1;
+    let other = (source.marks.len() > after + 1 && source.is_word(after, "else"))
+        .then(|| assignment(source, after + 1))
+        .flatten()
+        .filter(|(other, _)| *other == name);
+    Some(format!("{declared}{name} = if {condition} then {yes} else {}", other.map_or("…", |(_, no)| no)))
+}
+
+/// Whether a help fits into a line or two.
+fn is_short(help: &str) -> bool {
+    help.len() <= 110 && !help.contains('\n')
 }
 
 /// Reports `if` without `then` or `else`.
@@ -834,9 +924,11 @@ fn branch(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
     if (stop.at..piece.end).any(|at| source.is_word(at, missing)) {
         return None;
     }
+    let asked = slice(source, condition, stop.at.max(condition + 2) - 1);
     let (message, help) = match missing {
-        "then" => ("`if` needs a `then`", "write `if c then a else b`"),
-        _ => ("`if` needs an `else`", "both cases have a value: add `else ...`"),
+        "then" if is_short(asked) => ("`if` needs a `then`", format!("write `{asked} then a else b`")),
+        "then" => ("`if` needs a `then`", "write `if c then a else b`".into()),
+        _ => ("`if` needs an `else`", "both cases have a value: add `else ...`".into()),
     };
     let end = source.span(stop.at.max(piece.start + 1) - 1);
     Some(

@@ -71,8 +71,18 @@ const SLIPS: &[(&str, &str, &str)] = &[
     ),
     (
         "model A {\n  input v [m/s]\n  output F [N]\n  if v > 0 m/s\n    F = 1 N\n  else\n    F = -1 N\n  end\n}",
-        "write `F = if v > 0 then a else b`",
+        "write `F = if v > 0 m/s then 1 N else -1 N`",
         "model A {\n  input v [m/s]\n  output F [N]\n  F = if v > 0 m/s then 1 N else -1 N\n}",
+    ),
+    (
+        "model A {\n  input v [m/s]\n  output F [N] = v > 0 m/s ? 1 N : 2 N\n}",
+        "write `if v > 0 m/s then 1 N else 2 N`",
+        "model A {\n  input v [m/s]\n  output F [N] = if v > 0 m/s then 1 N else 2 N\n}",
+    ),
+    (
+        "model A {\n  param Fc = 1 N in > 0\n  param Fs = 2 N in > 0\n  input w [1] in 0 .. 1\n  output y [1/N] = 1 / (Fc + (Fs - Fc) * w)\n}",
+        "write `require Fs >= Fc`",
+        "model A {\n  param Fc = 1 N in > 0\n  param Fs = 2 N in > 0\n  require Fs >= Fc\n  input w [1] in 0 .. 1\n  output y [1/N] = 1 / (Fc + (Fs - Fc) * w)\n}",
     ),
     (
         "model A { input v [m/s]  output F [N] = if 0 m/s < v < 1 mm/s then 1 N else 2 N }",
@@ -101,8 +111,8 @@ const SLIPS: &[(&str, &str, &str)] = &[
     ),
     (
         "model A { input x [m]  output y [m] = prev(x) }",
-        "in `every Ts { next(y1) = y }`",
-        "model A { input x [m]  state y1 [m] = 0  every 1 ms { next(y1) = x }  output y [m] = y1 }",
+        "`every 1 ms { next(x1) = x }`",
+        "model A { input x [m]  state x1 [m] = 0  every 1 ms { next(x1) = x }  output y [m] = x1 }",
     ),
     (
         "model A { param chi = 0.5  let norm = 0.2^(1 + chi)  part b = Coulomb(v = 1 m/s, Fc = norm * 1 N)  output F [N] = b.F }",

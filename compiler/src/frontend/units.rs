@@ -713,8 +713,13 @@ impl Checker<'_> {
             ),
             Builtin::Unary(Unary::Sin | Unary::Cos | Unary::Tan) if self.resolved(term).base == TIME => (
                 unit.clone(),
-                "an angle is a rate times the time: `2 * pi * 1 Hz * t`, or `1 rad/s * t`; a signal `sine(1 N, 1 Hz)`"
-                    .into(),
+                match text.strip_suffix("* t").map(str::trim).filter(|factor| factor.parse::<f64>().is_ok()) {
+                    Some(factor) => format!(
+                        "the factor needs its unit: `{factor} rad/s * t`, or by a frequency `2 * pi * 1 Hz * t`; a signal `sine(1 N, 1 Hz)`"
+                    ),
+                    None => "an angle is a rate times the time: `2 * pi * 1 Hz * t`, or `1 rad/s * t`; a signal `sine(1 N, 1 Hz)`"
+                        .into(),
+                },
             ),
             _ => (unit.clone(), format!("divide by a quantity of the same kind: `{text} / 1 {unit}`")),
         };

@@ -627,18 +627,21 @@ impl<'a> Flattener<'a> {
                 self.error(span)
             }
             None if MeasureName::named(&function.text).is_some() => {
+                let of = args.first().map_or("…".into(), |arg| self.loaded.files.slice(arg.span).to_string());
                 let error =
                     Diagnostic::error("E0901", format!("`{}` is a measure: it belongs in `expect`", function.text))
                         .label(function.span, "needs the whole course of a quantity")
                         .help(match function.text.as_str() {
-                            "integral" => "as a quantity it is a state: `state i [m] = 0` and `di/dt = …`;\nover a whole run `show integral(…)` in an experiment".into(),
-                            name => format!("write `expect {name}(…) < …` in an experiment"),
+                            "integral" => format!(
+                                "as a quantity it is a state: `state i [m] = 0`, with its unit, and `di/dt = {of}`;\nover a whole run `show integral({of})` in an experiment"
+                            ),
+                            name => format!("write `expect {name}({of}) < …` in an experiment"),
                         });
                 self.report(error);
                 self.error(span)
             }
             None => {
-                self.unknown_function(function, env);
+                self.unknown_function(function, args, env);
                 self.error(span)
             }
         }
@@ -686,7 +689,7 @@ impl<'a> Flattener<'a> {
         let earlier = index.starts_with(|c: char| counter(&c)) && index.contains('-');
         let help = if earlier {
             format!(
-                "the value of a tick before is a state: `state {name}1 [m] = 0`, and `next({name}1) = {name}` in the `every` block;\n`delay({name}, 5 ms)` reaches back in continuous time"
+                "the value of a tick before is a state: `state {name}1 [m] = 0`, and `next({name}1) = {name}` in the `every` block;\nwrite `{name}1` in place of `{name}({index})`. `delay({name}, 5 ms)` reaches back in continuous time"
             )
         } else if index.parse::<f64>().is_ok() || index.starts_with(|c: char| counter(&c)) {
             format!("each name is one number: write `{name}`; the value at a time is a measure, `at({name}, 1 s)`")
@@ -698,7 +701,7 @@ impl<'a> Flattener<'a> {
         true
     }
 
-    pub(super) fn unknown_function(&mut self, function: &Name, env: &Env) {
+    pub(super) fn unknown_function(&mut self, function: &Name, args: &[Expr], env: &Env) {
         if self.explained(function, env.file) {
             return;
         }
@@ -709,36 +712,64 @@ impl<'a> Flattener<'a> {
         if self.unknowns > MOST_SUGGESTIONS {
             return self.report(error);
         }
+        // The help speaks of what the text gives to the function.
+        let given = |k: usize, other: &str| {
+            let text =
+                args.get(k).map(|arg| loaded.files.slice(arg.span).split_whitespace().collect::<Vec<_>>().join(" "));
+            text.filter(|text| text.len() <= 40).unwrap_or_else(|| other.to_string())
+        };
+        let x = given(0, "x");
+        let is_name = x.chars().all(|c| c.is_ascii_alphanumeric() || c == '_');
+        let earlier = if is_name { format!("{x}1") } else { "x1".into() };
         let mut known = loaded.visible(env.file, Space::Function);
         Builtin::all().for_each(|builtin| known.push(builtin.name()));
         let help = match function.text.as_str() {
+            "der" | "diff" | "ddt" if is_name => Some(format!(
+                "the derivative of a state is written `d{x}/dt`; of another quantity `slope({x})`, in `expect`, `show` and `plot`"
+            )),
             "der" | "diff" | "ddt" => Some("a derivative is written `dz/dt`".to_string()),
-            "sgn" | "signum" => Some("write `sign(…)`".into()),
-            "ln" => Some("write `log(…)`: the natural logarithm".into()),
-            "log10" => Some("write `log(…) / log(10)`".into()),
-            "pow" | "power" => Some("write `a ^ b`".into()),
-            "sat" | "limit" | "saturate" | "saturation" => Some("write `clamp(x, low, high)`".into()),
-            "fabs" | "norm" => Some("write `abs(…)`".into()),
-            "mod" | "rem" | "fmod" => Some("write `x - y * floor(x / y)`".into()),
-            "round" => Some("write `floor(x + 0.5)`".into()),
-            "ceil" => Some("write `-floor(-x)`".into()),
+            "sgn" | "signum" => Some(format!("write `sign({x})`")),
+            "ln" => Some(format!("write `log({x})`: the natural logarithm")),
+            "log10" => Some(format!("write `log({x}) / log(10)`")),
+            "pow" | "power" => Some(format!("write `({x})^({})`", given(1, "n"))),
+            "sat" | "limit" | "saturate" | "saturation" => Some(format!(
+                "write `clamp({x}, {}, {})` with its lower and its upper limit",
+                given(1, "-1 N"),
+                given(2, "1 N")
+            )),
+            "fabs" | "norm" => Some(format!("write `abs({x})`")),
+            "mod" | "rem" | "fmod" => {
+                let y = given(1, "y");
+                Some(format!("write `{x} - {y} * floor(({x}) / ({y}))`"))
+            }
+            "round" => Some(format!("write `floor({x} + 0.5)`")),
+            "ceil" => Some(format!("write `-floor(-({x}))`")),
             "heaviside" | "stepfun" => Some("write `if x > 0 then 1 else 0`; over time `step(1 s, 2 N)`".into()),
             "sum" | "total" => Some("`sum` adds a quantity of several parts: `part el[i in 1 .. 4] = Model(k = i * 1 N/m)`, then `sum(el.f)`; a fixed sum is written out".into()),
-            "prev" | "pre" | "last" | "memory" | "unitdelay" | "UnitDelay" => Some(
-                "a state keeps a value until the next tick: `state y1 [m] = 0`, and in `every Ts { next(y1) = y }`".into(),
-            ),
-            "integ" | "int" | "integrate" | "cumtrapz" => Some("an integral is a state: `state i [m] = 0` and `di/dt = …`".into()),
-            "interp1" | "interp" | "lookup" | "lut" => {
-                Some("a curve of points is a `table F(v [m/s]) [N] = linear { 0 m/s: 1 N, 1 m/s: 2 N }`".into())
+            "prev" | "pre" | "last" | "memory" | "unitdelay" | "UnitDelay" => Some(format!(
+                "a state keeps a value until the next tick: `state {earlier} [m] = 0`, with the unit of `{x}`, and\n`every 1 ms {{ next({earlier}) = {x} }}`; then `{earlier}` is `{x}` one tick before"
+            )),
+            "integ" | "int" | "integrate" | "cumtrapz" => {
+                Some(format!("an integral is a state: `state i [m] = 0`, with its unit, and `di/dt = {x}`"))
             }
-            "linspace" | "logspace" | "colon" => {
-                Some("values of a sweep: `sweep v = 1 mm/s .. 10 mm/s lin 5`, or `log 5`; points of a curve: `table`".into())
+            "interp1" | "interp" | "lookup" | "lut" => Some(format!(
+                "a curve of points stands outside of models, `table curve(v [m/s]) [N] = linear {{ 0 m/s: 1 N, 1 m/s: 2 N }}`;\nits value here is `curve({})`",
+                given(args.len().saturating_sub(1), "v")
+            )),
+            name @ ("linspace" | "logspace" | "colon") => {
+                let (spacing, count) = (if name == "logspace" { "log" } else { "lin" }, given(2, "5"));
+                Some(format!(
+                    "values of a sweep: `{x} .. {} {spacing} {count}`, with a unit at both ends as in\n`sweep v = 1 mm/s .. 10 mm/s {spacing} {count}`; points of a curve are a `table`",
+                    given(1, "10")
+                ))
             }
-            "overshoot" => Some("write `max(x) / final(x) - 1`, a measure of an experiment".into()),
-            "risetime" | "rise_time" => Some("write `first(x > 0.9 m) - first(x > 0.1 m)`, a measure of an experiment".into()),
-            "settlingtime" | "settling_time" | "stepinfo" => {
-                Some("write `settling(x, 1 mm)`, a measure of an experiment".into())
-            }
+            "overshoot" => Some(format!("write `max({x}) / final({x}) - 1`, a measure of an experiment")),
+            "risetime" | "rise_time" => Some(format!(
+                "write `first({x} > 0.9 m) - first({x} > 0.1 m)` with the unit of `{x}`, a measure of an experiment"
+            )),
+            "settlingtime" | "settling_time" | "stepinfo" => Some(format!(
+                "write `settling({x}, 1 mm)` with the band in the unit of `{x}`, a measure of an experiment"
+            )),
             "uniform" | "normal" | "gauss" | "lognormal" => {
                 Some("a distribution is drawn by `fric sweep FILE EXPERIMENT --vary 'k ~ uniform(1 N/m, 2 N/m)'`; a random signal is `noise(1 N, 1 ms, 1)`".into())
             }

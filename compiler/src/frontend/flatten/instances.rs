@@ -715,9 +715,15 @@ impl<'a> Flattener<'a> {
                 declarations(model).filter(of_kind).map(|d| d.name.text.as_str()).collect::<Vec<_>>()
             };
             let (values, states) = (given(false), given(true));
-            error = match (nearest(arg.name, values.iter().chain(&states).copied()), &*values, &*states) {
+            let near = nearest(arg.name, values.iter().chain(&states).copied());
+            // `Fcoul` for `Fc`: a name that goes on.
+            let begun = |known: &&&str| known.len() >= 2 && arg.name.starts_with(**known);
+            let near = near.or(values.iter().chain(&states).filter(begun).max_by_key(|known| known.len()).copied());
+            error = match (near, &*values, &*states) {
                 // A short name is near to many: all arguments are listed.
-                (Some(near), [_, _, ..], _) if values.len() <= MOST_TAKEN && arg.name.len() <= 3 => {
+                (Some(near), [_, _, ..], _)
+                    if values.len() <= MOST_TAKEN && (arg.name.len() <= 3 || arg.name.starts_with(near)) =>
+                {
                     error.help(format!("did you mean `{near}`? {owner} takes {}", values.join(", ")))
                 }
                 (Some(near), ..) => error.help(format!("did you mean `{near}`?")),
