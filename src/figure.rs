@@ -246,9 +246,13 @@ fn without(label: &str, path: &str) -> String {
     let mut kept: Vec<&str> = Vec::new();
     for end in ends {
         let one = label[from.min(end)..end].trim();
+        // `a = 1, 2` does not occur: a value has no comma outside brackets. `a, b = 1` has both.
+        if end < label.len() && !one.contains('=') {
+            continue;
+        }
         from = end + 1;
-        // `a = 1, 2` does not occur: a value has no comma outside brackets.
-        let own = one.split_once('=').is_some_and(|(name, _)| name.trim() == path);
+        let names = one.split_once('=').map_or("", |(names, _)| names.trim());
+        let own = names == path || names.split(',').any(|name| name.trim() == path);
         if !own && !one.is_empty() {
             kept.push(one);
         }
@@ -264,11 +268,34 @@ fn points(case: &Recorded, series: &Series, k: usize) -> Vec<(f64, f64)> {
     let Some(y) = recording.column(series) else { return Vec::new() };
     let x = plot.against.as_ref().and_then(|against| Some((recording.column(against)?, &against.unit)));
     let (after, before) = (plot.view.after.unwrap_or(f64::NEG_INFINITY), plot.view.before.unwrap_or(f64::INFINITY));
-    let shown = |row: &[f64]| {
-        let x = x.map_or(row[0], |(column, unit)| unit.from_si(row[column + 1]));
-        (x, series.unit.from_si(row[y + 1]))
-    };
-    recording.rows().filter(|row| row[0] >= after && row[0] <= before).map(shown).collect()
+    let x = |row: &[f64]| x.map_or(row[0], |(column, unit)| unit.from_si(row[column + 1]));
+    let rows = recording.rows().map(|row| (row[0], x(row), series.unit.from_si(row[y + 1])));
+    within(rows, (after, before), series.boolean)
+}
+
+/// The points of rows of a time, x and y within a window. Where the window begins or ends between two rows, it has a
+/// point there, on the line between them; of a truth value (`held`) with the value of the row before.
+fn within(rows: impl Iterator<Item = (f64, f64, f64)>, (after, before): (f64, f64), held: bool) -> Vec<(f64, f64)> {
+    let mut points = Vec::new();
+    let mut last: Option<(f64, f64, f64)> = None;
+    for row in rows {
+        if let Some(from) = last {
+            let edge = |t: f64| {
+                let part = (t - from.0) / (row.0 - from.0);
+                let at = |a: f64, b: f64| a + part * (b - a);
+                (at(from.1, row.1), if held { from.2 } else { at(from.2, row.2) })
+            };
+            points.extend([after, before].into_iter().filter(|t| from.0 < *t && *t < row.0).map(edge));
+        }
+        if row.0 >= after && row.0 <= before {
+            points.push((row.1, row.2));
+        }
+        if row.0 > before {
+            break;
+        }
+        last = Some(row);
+    }
+    points
 }
 
 /// Whether a series is equal in all cases, at the resolution of a picture.
@@ -299,7 +326,44 @@ fn value_at(points: &[(f64, f64)], t: f64) -> f64 {
 
 #[cfg(test)]
 mod tests {
-    use super::without;
+    use super::{within, without};
+
+    /// A closed curve over one period, whose rows do not lie on the ends of the window: it has its whole period, and it
+    /// closes. The rows are those of a polygon, so that the points on its edges are exact.
+    #[test]
+    fn a_window_begins_and_ends_on_its_edges() {
+        let seed = std::env::var("FRIC_SEED").ok().and_then(|seed| seed.parse().ok()).unwrap_or(6);
+        let mut random = compiler::ir::random::Random(seed);
+        for case in 0..300 {
+            let period = random.within(0.1, 3.0);
+            let mut corners: Vec<f64> = (0..2 + random.below(9)).map(|_| random.within(0.0, period)).collect();
+            corners.sort_by(f64::total_cmp);
+            let values: Vec<(f64, f64)> =
+                corners.iter().map(|_| (random.within(-1.0, 1.0), random.within(-1.0, 1.0))).collect();
+            let rows: Vec<(f64, f64, f64)> = (0..4)
+                .flat_map(|round| {
+                    let at = f64::from(round) * period;
+                    corners.iter().zip(&values).map(move |(t, (x, y))| (at + t, *x, *y))
+                })
+                .collect();
+            let after = random.within(1.0, 1.9) * period;
+            let points = within(rows.iter().copied(), (after, after + period), false);
+            let (first, last) = (points[0], points[points.len() - 1]);
+            let told = format!("seed {seed}, case {case}: {first:?} {last:?}");
+            assert!((first.0 - last.0).abs() < 1e-9 && (first.1 - last.1).abs() < 1e-9, "{told}");
+            // One round has each corner once, and both ends.
+            assert!(points.len() >= corners.len() + 1, "{told}");
+            // Without a window nothing is added; a window beyond the rows is empty.
+            let all = within(rows.iter().copied(), (f64::NEG_INFINITY, f64::INFINITY), false);
+            assert_eq!(all.len(), rows.len(), "{told}");
+            assert!(within(rows.iter().copied(), (10.0 * period, 11.0 * period), false).is_empty(), "{told}");
+            // A window within one edge has two points; a truth value keeps that of the row before.
+            let (from, to) = (rows[0].0, rows[1].0);
+            let inside = (from + 0.25 * (to - from), from + 0.75 * (to - from));
+            let held = within(rows.iter().copied(), inside, true);
+            assert!(held.len() == 2 && held.iter().all(|point| point.1 == rows[0].2), "{told}: {held:?}");
+        }
+    }
 
     #[test]
     fn a_label_loses_the_parameter_on_the_axis() {
@@ -307,5 +371,9 @@ mod tests {
         assert_eq!(without(label, "rate"), "fr = LuGre(Fs = 1 N, vs = 1 mm/s), m = 1 kg");
         assert_eq!(without(label, "vs"), label);
         assert_eq!(without("rate = 5 N/s", "rate"), "");
+        let joint = "x.k, y.k = 5 N/m, fr = Dahl()";
+        assert_eq!(without(joint, "y.k"), "fr = Dahl()");
+        assert_eq!(without(joint, "x.k, y.k"), "fr = Dahl()");
+        assert_eq!(without(joint, "fr"), "x.k, y.k = 5 N/m");
     }
 }

@@ -226,6 +226,15 @@ pub fn read(
     let said: Vec<String> =
         given.set.iter().map(|set| path(&set.path)).chain(given.vary.iter().map(|p| plain(p))).collect();
     parts.sweeps.retain(|sweep| !said.contains(&path(&sweep.path)));
+    // So does a sweep from outside, which stands after those of the text.
+    let swept: Vec<Vec<String>> =
+        parts.sweeps.iter().map(|sweep| std::iter::once(&sweep.path).chain(&sweep.also).map(path).collect()).collect();
+    let later = |k: usize| swept[k + 1..].iter().flatten().any(|path| swept[k].contains(path));
+    let mut k = 0;
+    parts.sweeps.retain(|sweep| {
+        k += 1;
+        loaded.files.get(sweep.span.file).name.starts_with("--") || !later(k - 1)
+    });
     let steady = fit.is_some() && parts.data.is_some_and(of_fit::is_steady);
     let data =
         parts.data.map_or(Some(Vec::new()), |data| recording(loaded, sources, root, data, steady, &mut diagnostics));
@@ -243,9 +252,9 @@ pub fn read(
             };
             data.iter_mut().for_each(|(_, table, _)| table.x.clone_from(&rows));
         }
-        if parts.solver.is_none() && given.method.is_none() && given.step.is_none() {
+        if parts.solver.is_none() && given.method.is_none() {
             let (method, step, tol) = of_fit::default_solver(fit, &rows, steady);
-            (given.method, given.step, given.tol) = (Some(method), step, given.tol.or(tol));
+            (given.method, given.step, given.tol) = (Some(method), given.step.or(step), given.tol.or(tol));
         }
     }
     let grids = grids(loaded, &parts, &mut diagnostics);
@@ -271,7 +280,7 @@ pub fn read(
     let arg_paths: Vec<ast::Path> = args.iter().map(ast::Bind::path).collect();
     let mut variants = Vec::new();
     for combination in combinations {
-        let label = label(loaded, &combination);
+        let label = label(loaded, &parts, &combination);
         let applies = |expect: &&ast::Expect| {
             expect.cases.iter().all(|case| {
                 let found = combination.iter().find(|(change, _)| same_path(change.path, &case.path));

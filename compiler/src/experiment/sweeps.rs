@@ -207,14 +207,17 @@ pub(super) fn unmatched_cases(
     errors
 }
 
-/// `fr = LuGre(), k = 2 N/m`
-pub(super) fn label(loaded: &Loaded, combination: &[(Change, Option<String>)]) -> String {
+/// `fr = LuGre(), k = 2 N/m`; of a sweep over several quantities together `x.k, y.k = 2 N/m`.
+pub(super) fn label(loaded: &Loaded, parts: &Statements, combination: &[(Change, Option<String>)]) -> String {
     let one = |(change, text): &(Change, Option<String>)| {
         let value = text.clone().unwrap_or_else(|| match change.value {
             OverrideValue::Expr(expr) => loaded.files.slice(expr.span).to_string(),
             OverrideValue::Instance(instance) => one_line(loaded.files.slice(instance.span)),
         });
-        format!("{} = {value}", loaded.files.slice(change.path.span))
+        let sweep = parts.sweeps.iter().find(|sweep| std::ptr::eq(&sweep.path, change.path));
+        let also = sweep.map_or(&[][..], |sweep| &sweep.also[..]);
+        let paths = std::iter::once(change.path).chain(also).map(|path| loaded.files.slice(path.span));
+        format!("{} = {value}", paths.collect::<Vec<_>>().join(", "))
     };
     combination.iter().map(one).collect::<Vec<_>>().join(", ")
 }
