@@ -176,7 +176,42 @@ pub struct Stepped {
     pub step: Option<f64>,
 }
 
+/// Why one of these options would be without effect on a run by this method: steps are fixed or adaptive. `given`: the
+/// method of the command line.
+fn without_effect(
+    name: &str,
+    method: Method,
+    (given, step, tol): (Option<Method>, Option<f64>, Option<f64>),
+) -> Option<String> {
+    match (method, given) {
+        (Method::Adaptive, Some(_)) if step.is_some() => {
+            Some("--step is for fixed steps, and `--solver adaptive` chooses its own: leave one of them out".into())
+        }
+        (Method::Adaptive, None) if step.is_some() => Some(format!(
+            "--step is for fixed steps, and `{name}` is run by adaptive ones: add `--solver expo`, which is exact for \
+             bristles and filters, or another of {}; or leave it out",
+            Method::list(Method::fixed())
+        )),
+        (Method::Adaptive, _) => None,
+        (fixed, _) if tol.is_some() => Some(format!(
+            "--tol is for adaptive steps, and `{name}` takes fixed ones of `{}`: add `--solver adaptive`, or leave it out",
+            fixed.name()
+        )),
+        _ => None,
+    }
+}
+
 impl Stepped {
+    /// Why one of them would be without effect on an experiment that is run by this method.
+    pub fn without_effect(&self, name: &str, method: Method) -> Option<String> {
+        without_effect(name, method, (self.solver, self.step, None))
+    }
+
+    /// The same of them and a tolerance.
+    pub fn without_effect_and(&self, tol: Option<f64>, name: &str, method: Method) -> Option<String> {
+        without_effect(name, method, (self.solver, self.step, tol))
+    }
+
     /// The changes to an experiment that they are.
     pub fn changes(&self) -> Changes {
         Changes { method: self.solver, step: self.step, ..self.set.changes() }
@@ -238,7 +273,7 @@ pub struct Look {
     /// Panels side by side [default: 1]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u8).range(1..=6))]
     pub columns: Option<u8>,
-    /// Its title in place of name and solver; "" for none
+    /// Its title in place of name and solver; "" for none, and no names of experiments over its panels
     #[arg(long, value_name = "TEXT")]
     pub title: Option<String>,
 }
@@ -269,6 +304,24 @@ impl Figures {
 }
 
 impl Look {
+    /// The first of these options that is given: without a figure it would be without effect.
+    pub fn given(&self) -> Option<&'static str> {
+        let given = [
+            (self.size.is_some(), "--size"),
+            (self.font.is_some(), "--font"),
+            (self.lines.is_some(), "--lines"),
+            (self.columns.is_some(), "--columns"),
+            (self.title.is_some(), "--title"),
+        ];
+        given.into_iter().find(|(given, _)| *given).map(|(_, option)| option)
+    }
+
+    /// Why an option is without effect where no figure is written; `remedy`: the option that writes one.
+    pub fn unused(&self, drawn: bool, remedy: &str) -> Option<String> {
+        let option = self.given().filter(|_| !drawn)?;
+        Some(format!("{option} is for a figure, and none is written: add {remedy}"))
+    }
+
     /// As the renderers read it.
     pub fn look(&self) -> plot::Look {
         let usual = plot::Look::default();
@@ -375,7 +428,9 @@ pub struct Sweep {
     pub file: PathBuf,
     /// The experiment in it to run
     pub experiment: String,
-    /// What changes: 'fr.Fs = 1 N .. 2 N by 0.1 N', 'k = 1 N/m .. 100 N/m log 9', 'm = 1 kg, 2 kg', 'fr.vs ~ lognormal(1 mm/s, 0.2)', also normal, uniform
+    /// What changes: 'fr.Fs = 1 N .. 2 N by 0.1 N', 'k = 1 N/m .. 100 N/m log 9', 'm = 1 kg, 2 kg'; 'fr.Fs = ±20 %' of its
+    /// value, also 'lin 5'; 'x.k, y.k = 1 N/m, 2 N/m' together; 'fr = LuGre(), Dahl()' for a slot; 'fr.vs ~ lognormal(1 mm/s,
+    /// 0.2)', also normal, uniform, '~ ±20 %'
     #[arg(long, value_name = "CHANGE", value_parser = vary::parse)]
     pub vary: Vec<Vary>,
     /// Print the K best rows: '5 by rms(e)', '3 by greatest period(x)'; of distributions by the mean, or '5 by p95 rms(e)'
@@ -384,9 +439,9 @@ pub struct Sweep {
     /// Draws of the distributions, at each point of the grids [default: 100]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..=1_000_000_000))]
     pub runs: Option<u64>,
-    /// Seed of all random numbers
-    #[arg(long, value_name = "NUMBER", default_value_t = 1)]
-    pub seed: u64,
+    /// Seed of all random numbers [default: 1]
+    #[arg(long, value_name = "NUMBER")]
+    pub seed: Option<u64>,
     /// The table to write: .csv or .parquet
     #[arg(long, value_name = "FILE", default_value = "sweep.csv", value_hint = ValueHint::FilePath, value_parser = table)]
     pub out: PathBuf,
@@ -1356,5 +1411,76 @@ mod tests {
     fn settings_split_at_the_first_equals_sign() {
         assert_eq!(setting("fr=LuGre(Fs = 2 N)"), Ok(("fr".into(), "LuGre(Fs = 2 N)".into())));
         assert!(setting("fr.Fs").is_err() && setting("=2").is_err() && setting("fr.Fs=").is_err());
+    }
+
+    /// Words of a command line, quotes taken off, up to a comment or a pipe.
+    fn words(line: &str) -> Vec<String> {
+        let (mut words, mut word, mut quote): (Vec<String>, Option<String>, Option<char>) = (Vec::new(), None, None);
+        for c in line.chars() {
+            match (quote, c) {
+                (Some(open), c) if c == open => quote = None,
+                (None, '\'' | '"') => {
+                    quote = Some(c);
+                    word.get_or_insert_default();
+                }
+                (None, '#' | '|' | '>' | '&' | '<') if word.is_none() => break,
+                (None, c) if c.is_whitespace() => words.extend(word.take()),
+                (_, c) => word.get_or_insert_default().push(c),
+            }
+        }
+        words.extend(word);
+        words
+    }
+
+    /// Every command of the documents is one that this program takes.
+    #[test]
+    fn commands_in_the_documents_are_read() {
+        let root = std::path::Path::new(env!("CARGO_MANIFEST_DIR"));
+        let mut files: Vec<PathBuf> =
+            std::fs::read_dir(root.join("docs")).unwrap().map(|entry| entry.unwrap().path()).collect();
+        files.extend(["README.md", "examples/README.md"].map(|name| root.join(name)));
+        files.retain(|path| path.extension().is_some_and(|ending| ending == "md"));
+        files.sort();
+        let (mut read, mut wrong) = (0, Vec::new());
+        for file in files {
+            let text = std::fs::read_to_string(&file).unwrap();
+            let (mut fenced, mut line_number) = (false, 0);
+            // A line that ends with `\\` goes on.
+            for line in text.replace("\\\n", " ").lines() {
+                line_number += 1;
+                if line.trim_start().starts_with("```") {
+                    fenced = !fenced;
+                    continue;
+                }
+                let line = line.trim_start_matches("$ ");
+                if !fenced || !line.starts_with("fric ") {
+                    continue;
+                }
+                let words = words(line);
+                // Forms, not commands: `fric bus ADDRESS …`.
+                let form = |word: &String| {
+                    word.contains(['…', '[', '<']) || word.len() > 2 && word.chars().all(|c| c.is_ascii_uppercase())
+                };
+                if words.iter().skip(1).any(form) {
+                    continue;
+                }
+                read += 1;
+                if let Err(error) = Args::try_parse_from(&words)
+                    && !matches!(
+                        error.kind(),
+                        clap::error::ErrorKind::DisplayHelp | clap::error::ErrorKind::DisplayVersion
+                    )
+                {
+                    let why = error.to_string();
+                    wrong.push(format!(
+                        "{}:{line_number}: {line}: {}",
+                        file.display(),
+                        why.lines().next().unwrap_or_default()
+                    ));
+                }
+            }
+        }
+        assert!(read > 40, "{read}");
+        assert!(wrong.is_empty(), "{} of {read}:\n{}", wrong.len(), wrong.join("\n"));
     }
 }

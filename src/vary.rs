@@ -14,7 +14,7 @@ const MOST_VALUES: usize = 10_000_000;
 /// One varied parameter.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Vary {
-    /// Its path.
+    /// Its path; several that take the same values together are separated by commas: `x.k, y.k`.
     pub path: String,
     /// The unit of its values as written.
     pub unit: Unit,
@@ -33,6 +33,10 @@ pub enum How {
     Lognormal(f64, f64),
     /// Uniform distribution between two bounds.
     Uniform(f64, f64),
+    /// This part of the value in the text to either side: a grid of so many values, or evenly distributed.
+    Around(f64, Option<usize>),
+    /// Models for a slot, as text.
+    Models(String),
 }
 
 /// Parses one `--vary`.
@@ -41,14 +45,52 @@ pub enum How {
 /// What is wrong with it, and how to write it.
 pub fn parse(text: &str) -> Result<Vary, String> {
     const EXAMPLES: &str = "write it as `fr.Fs = 1 N .. 2 N by 0.1 N`, `fr.Fs = 1 N .. 100 N log 10`, `fr.Fs = 1 N, 2 N`, \
-        or `fr.vs ~ normal(1 mm/s, 0.1 mm/s)`, lognormal(median, spread), uniform(from, to)";
+        `fr.Fs = ±20 %`, `x.k, y.k = 1 N/m, 2 N/m` for both together, `fr = LuGre(), Dahl()` for a slot, or `fr.vs ~ normal(1 mm/s, 0.1 mm/s)`, lognormal(median, spread), uniform(from, to)";
     let split = text.find(['=', '~']).ok_or(EXAMPLES)?;
     let (path, rest) = (text[..split].trim(), text[split + 1..].trim());
     if path.is_empty() || rest.is_empty() {
         return Err(EXAMPLES.into());
     }
-    let (unit, how) = if text[split..].starts_with('~') { drawn(rest, EXAMPLES)? } else { listed(rest, EXAMPLES)? };
-    Ok(Vary { path: path.into(), unit, how })
+    let paths: Vec<&str> = path.split(',').map(str::trim).collect();
+    if let Some(k) = (0..paths.len()).find(|k| paths[*k].is_empty() || paths[..*k].contains(&paths[*k])) {
+        return Err(match paths[k] {
+            "" => EXAMPLES.into(),
+            twice => format!("`{twice}` stands twice before `=`"),
+        });
+    }
+    let is_drawn = text[split..].starts_with('~');
+    let model = rest.trim_start_matches("rotary ").trim_start();
+    let (unit, how) = if let Some(share) = rest.strip_prefix('±').or(rest.strip_prefix("+-")) {
+        (Unit::none(), around(share, is_drawn)?)
+    } else if model.starts_with(|c: char| c.is_ascii_uppercase()) && model.contains('(') && !is_drawn {
+        (Unit::none(), How::Models(rest.into()))
+    } else if is_drawn {
+        drawn(rest, EXAMPLES)?
+    } else {
+        listed(rest, EXAMPLES)?
+    };
+    Ok(Vary { path: paths.join(", "), unit, how })
+}
+
+/// `20 %`, `20 % lin 5`.
+fn around(text: &str, is_drawn: bool) -> Result<How, String> {
+    let (share, count) = match text.split_once(" lin ") {
+        Some(_) if is_drawn => {
+            return Err("`lin` is for values, which follow `=`; `~ ±20 %` draws between the ends".into());
+        }
+        Some((share, count)) => (share, Some(count)),
+        None => (text, None),
+    };
+    let (part, unit) = quantity::parse(share)?;
+    if unit.text != "%" || part <= 0.0 {
+        return Err(format!("`±{}` is no share of the value in the text: write `±20 %`", share.trim()));
+    }
+    let count = match count.map(|count| count.trim().parse::<usize>()) {
+        None => 3,
+        Some(Ok(count)) if (2..=MOST_VALUES).contains(&count) => count,
+        Some(_) => return Err(format!("`lin` is followed by a number of values: 2 to {MOST_VALUES}")),
+    };
+    Ok(How::Around(part, (!is_drawn).then_some(count)))
 }
 
 /// Names of the distributions.
@@ -158,12 +200,33 @@ fn of_one_kind(texts: &[&str]) -> Result<(Vec<f64>, Unit), String> {
 }
 
 impl Vary {
+    /// Its path, or those that take the same values together.
+    pub fn paths(&self) -> impl Iterator<Item = &str> {
+        self.path.split(", ")
+    }
+
     /// Number of values of a grid; none for a distribution.
     pub fn len(&self) -> Option<usize> {
         match &self.how {
             How::Values(values) => Some(values.len()),
-            How::Normal(..) | How::Lognormal(..) | How::Uniform(..) => None,
+            How::Around(_, count) => *count,
+            How::Normal(..) | How::Lognormal(..) | How::Uniform(..) | How::Models(_) => None,
         }
+    }
+
+    /// What lies around a value, as a grid or a distribution in its unit: `±20 %` of 1 N is 0.8 N, 1 N, 1.2 N.
+    pub fn around(&self, middle: f64, unit: &Unit) -> Vary {
+        let How::Around(part, count) = self.how else { return self.clone() };
+        // Rounded as a grid that is written out.
+        let at = |share: f64| {
+            let shown: f64 = format!("{:.11e}", unit.from_si(middle * (1.0 + share))).parse().unwrap_or(f64::NAN);
+            quantity::si(shown, unit)
+        };
+        let how = match count {
+            Some(count) => How::Values(spaced(count, -part, part, false).into_iter().map(at).collect()),
+            None => How::Uniform(at(-part).min(at(part)), at(-part).max(at(part))),
+        };
+        Vary { path: self.path.clone(), unit: unit.clone(), how }
     }
 
     /// A typical value, to check whether the text compiles with it.
@@ -173,6 +236,7 @@ impl Vary {
             How::Normal(mean, _) => *mean,
             How::Lognormal(median, _) => *median,
             How::Uniform(low, high) => 0.5 * (low + high),
+            How::Around(..) | How::Models(_) => f64::NAN,
         }
     }
 }
@@ -200,6 +264,7 @@ impl Dice {
             How::Lognormal(median, spread) => median * self.exp.at(spread * self.normal(uniform)),
             How::Uniform(low, high) => low + (high - low) * uniform,
             How::Values(ref values) => values[(uniform * values.len() as f64) as usize],
+            How::Around(..) | How::Models(_) => unreachable!("it is a grid or a distribution by now"),
         }
     }
 
@@ -318,6 +383,14 @@ mod tests {
         assert_eq!((vs.unit.text.as_str(), vs.how), ("mm/s", How::Lognormal(1e-3, 0.2)));
         assert_eq!(parse("m~uniform(1kg, 2kg)").unwrap().how, How::Uniform(1.0, 2.0));
         assert_eq!(parse("m ~ normal(1 kg, 50 g)").unwrap().how, How::Normal(1.0, 0.05));
+        let both = parse("x.k ,y.k = 1 N/m, 2 N/m").unwrap();
+        assert_eq!((both.path.as_str(), both.paths().count()), ("x.k, y.k", 2));
+        let newton = Unit::parse("N").unwrap();
+        let around = |text: &str| parse(text).unwrap().around(2.0, &newton).how;
+        assert_eq!(around("Fs = ±20 %"), How::Values(vec![1.6, 2.0, 2.4]));
+        assert_eq!(around("Fs = +-10% lin 5"), How::Values(vec![1.8, 1.9, 2.0, 2.1, 2.2]));
+        assert_eq!(around("Fs ~ ±50 %"), How::Uniform(1.0, 3.0));
+        assert_eq!(parse("fr = LuGre(Fs = 2 N), Dahl()").unwrap().how, How::Models("LuGre(Fs = 2 N), Dahl()".into()));
     }
 
     #[test]
@@ -332,6 +405,9 @@ mod tests {
         assert!(told("m = 1 kg .. 2 kg by 1 ng").contains("too many"));
         assert!(told("m = 0 kg .. 2 kg log 5").contains("neither is 0"));
         assert!(told("m = 1 kg .. 2 kg log 1.5").contains("no number of values"));
+        assert!(told("m = ±1 kg").contains("no share"));
+        assert!(told("m, m = 1 kg, 2 kg").contains("twice"));
+        assert!(told("m ~ ±5 % lin 3").contains("follow `=`"));
     }
 
     #[test]

@@ -1035,3 +1035,179 @@ fn each_case_of_a_sweep_is_drawn_in_its_own_window() {
         }
     }
 }
+
+/// Experiments of every kind that an option of `fric run` can meet.
+const KINDS: &str = r#"
+model Pull {
+  param  k  = 2 N/m      in > 0
+  param  c  = 0.3 N·s/m  in > 0
+  state  x [m] = 0
+  state  v [mm/s] = 0
+  dx/dt  = v
+  dv/dt  = (k * (0.1 m/s * t - x) - c * v) / 1 kg
+}
+experiment free  { run Pull() for 2 s plot x [mm], v [mm/s] expect max(v) > 0 m/s }
+experiment fixed { run Pull() for 2 s solver rk4 step 0.1 ms plot x [mm], v [mm/s] expect max(v) > 0 m/s }
+experiment told  { run Pull() for 2 s expect max(v) > 0 m/s }
+experiment noted { run Pull() for 2 s solver expo step 1 ms record x, v expect max(v) > 0 m/s }
+experiment swept { run Pull() for 2 s sweep k = 1 N/m, 2 N/m plot x [mm], v [mm/s] expect max(v) > 0 m/s }
+fit found {
+  run  Pull()
+  data "f.csv" (t [s], x [mm])
+  vary k in 1 N/m .. 3 N/m
+  minimise rms(x - data.x)
+}
+"#;
+
+/// Exit code, words and files of a command.
+type Effect = (Option<i32>, String, Vec<(String, Vec<u8>)>);
+
+/// What a command says and writes, without the times that it took.
+fn effect(folder: &Folder, args: &[&str]) -> Effect {
+    let place = folder.0.join("place");
+    let _ = fs::remove_dir_all(&place);
+    fs::create_dir_all(&place).unwrap();
+    fs::write(place.join("k.fric"), KINDS).unwrap();
+    fs::write(place.join("f.csv"), "t [s],x [mm]\n0,0\n0.1,0.03\n0.2,0.26\n0.3,0.88\n0.4,2.05\n0.5,3.94\n").unwrap();
+    let output = Command::new(env!("CARGO_BIN_EXE_fric")).current_dir(&place).args(args).output().unwrap();
+    let mut said = String::from_utf8(output.stdout).unwrap();
+    said += &String::from_utf8(output.stderr).unwrap();
+    let timeless = |line: &str| match serde_json::from_str::<Value>(line) {
+        Ok(Value::Object(mut object)) => {
+            object.retain(|key, _| !key.ends_with("_seconds"));
+            Value::Object(object).to_string()
+        }
+        _ if line.contains("compiled in") || line.contains("runs in") => String::new(),
+        _ => line.split(" in ").next().unwrap_or_default().to_string(),
+    };
+    let said = said.lines().map(timeless).collect::<Vec<_>>().join("\n");
+    let mut files = Vec::new();
+    let mut folders = vec![place.clone()];
+    while let Some(at) = folders.pop() {
+        for entry in fs::read_dir(at).unwrap() {
+            let path = entry.unwrap().path();
+            match path.is_dir() {
+                true => folders.push(path),
+                false => files.push((path.display().to_string(), fs::read(&path).unwrap())),
+            }
+        }
+    }
+    files.sort();
+    (output.status.code(), said, files)
+}
+
+/// Every option changes what comes out, or is refused by its name with exit code 2, or is told to be without effect:
+/// for each kind of experiment, alone and with others.
+#[test]
+fn every_option_has_an_effect_or_a_word() {
+    let folder = Folder::new("options");
+    let options: [&[&str]; 19] = [
+        &["--solver", "euler"],
+        &["--step", "0.4ms"],
+        &["--tol", "1e-3"],
+        &["--for", "1s"],
+        &["--set", "k=3N/m"],
+        &["--out", "o"],
+        &["--plot", "p.svg"],
+        &["--size", "85x60mm"],
+        &["--font", "20pt"],
+        &["--lines", "grey"],
+        &["--columns", "2"],
+        &["--title", "words"],
+        &["--data", "d.csv"],
+        &["--every", "7ms"],
+        &["--thin"],
+        &["--digits", "3"],
+        &["--no-error"],
+        &["--cross"],
+        &["--open"],
+    ];
+    let mut silent = Vec::new();
+    for kind in ["free", "fixed", "told", "noted", "swept"] {
+        for others in [&[][..], &["--json"]] {
+            let base = [&["run", "k.fric", kind], others].concat();
+            let without = effect(&folder, &base);
+            for option in options {
+                let with = effect(&folder, &[&base[..], option].concat());
+                let refused = with.0 == Some(2) && with.1.contains(option[0]);
+                let told = with.1.contains(option[0]) && !without.1.contains(option[0]);
+                if !(refused || told || with.0 != Some(2) && with != without) {
+                    silent.push(format!("run {kind} {others:?} {option:?}: {:?} {}", with.0, with.1));
+                }
+            }
+        }
+    }
+    // Other commands: the option is refused by its name.
+    for args in [
+        "fit k.fric found --step 1ms",
+        "fit k.fric found --solver rk4 --step 1ms --tol 1e-6",
+        "bench k.fric free --step 1ms",
+        "build k.fric free --emit ir --step 1ms",
+        "sweep k.fric free --vary k=1N/m,2N/m --step 1ms",
+        "sweep k.fric fixed --vary k=1N/m,2N/m --tol 1e-3",
+        "sweep k.fric fixed --vary k=1N/m,2N/m --seed 2",
+        "sweep k.fric fixed --vary k=1N/m,2N/m --runs 20",
+        "sweep k.fric fixed --vary k=1N/m,2N/m --size 85x60mm",
+        "run k.fric free --solver adaptive --step 1ms",
+        "linearise k.fric Pull --font 9pt",
+        "characterise Dahl --size 85x60mm",
+        "compare Dahl LuGre --title words",
+    ] {
+        let words: Vec<&str> = args.split(' ').collect();
+        let option = words.iter().rev().find(|word| word.starts_with("--")).unwrap();
+        let (code, said, _) = effect(&folder, &words);
+        if !(code == Some(2) && said.contains(option)) {
+            silent.push(format!("{args}: {code:?} {said}"));
+        }
+    }
+    assert!(silent.is_empty(), "{} options are silent:\n{}", silent.len(), silent.join("\n"));
+}
+
+/// Rows of a joint sweep, of shares of values, and of models in a slot are those of runs that set the same values.
+#[test]
+fn joint_and_relative_sweeps_are_runs_with_these_values() {
+    let folder = Folder::new("joint").with("k.fric", KINDS);
+    let table = |vary: &str| {
+        folder.check(&["sweep", "k.fric", "free", "--vary", vary, "--no-error", "--out", "s.csv"], 0, "");
+        let text = fs::read_to_string(folder.0.join("s.csv")).unwrap();
+        let rows = text.lines().map(|line| line.split(',').map(str::to_string).collect::<Vec<_>>());
+        rows.collect::<Vec<_>>()
+    };
+    let run = |set: &[String]| {
+        let mut args = vec!["run", "k.fric", "free", "--json", "--no-error"];
+        set.iter().for_each(|set| args.extend(["--set", set]));
+        let (out, _) = folder.check(&args, 0, "");
+        let seen: Value = serde_json::from_str(&out).unwrap();
+        seen["expects"][0]["readings"][0]["value"].as_f64().unwrap()
+    };
+    let last = |row: &[String]| row[row.len() - 3].parse::<f64>().unwrap();
+    // Both parameters, each by the same share of its own value.
+    let rows = table("k,c = ±30 % lin 4");
+    for (row, part) in rows[1..].iter().zip([0.7, 0.9, 1.1, 1.3]) {
+        let expected = run(&[format!("k={}N/m", 2.0 * part), format!("c={}N·s/m", 0.3 * part)]);
+        assert!((last(row) - expected).abs() <= 1e-6 * expected, "{row:?}: {expected}");
+    }
+    assert_eq!(rows.len(), 5);
+    // One parameter, in its own unit.
+    for row in &table("c = +-20 %")[1..] {
+        let expected = run(&[format!("c={}N·s/m", row[1])]);
+        assert!((last(row) - expected).abs() <= 1e-6 * expected, "{row:?}: {expected}");
+    }
+    // Refused, with what is wrong.
+    let refused = |vary: &str, words: &str| folder.check(&["sweep", "k.fric", "free", "--vary", vary], 2, words);
+    refused("k, c = 1 N/m, 2 N/m", "`c` is a viscous coefficient, it cannot be a stiffness");
+    refused("x = ±20 %", "`x` is 0 m in the text, of which there is no share");
+    refused("k = ±20", "no share");
+}
+
+/// A label names every quantity that a sweep changes together, and so do the files.
+#[test]
+fn a_joint_sweep_names_all_its_quantities() {
+    let text = KINDS
+        .replace("sweep k = 1 N/m, 2 N/m plot", "sweep k, c = 1 N/m, 2 N/m plot")
+        .replace("c * v) / 1 kg", "c * v * 1 s) / 1 kg")
+        .replace("c  = 0.3 N·s/m", "c  = 0.3 N/m");
+    let folder = Folder::new("joint-names").with("k.fric", text);
+    folder.check(&["run", "k.fric", "swept", "--out", "o"], 0, "k, c = 2 N/m");
+    assert_eq!(folder.names("o"), ["swept-k-c-1-N-m.csv", "swept-k-c-2-N-m.csv", "swept.svg"]);
+}

@@ -31,6 +31,10 @@ pub fn bench(args: &Bench, terminal: &mut Terminal) -> End {
     };
     let case = cases.remove(0);
     let solver = case.experiment.solver;
+    if let Some(why) = args.stepped.without_effect(&args.experiment, solver.method) {
+        terminal.error(&why);
+        return End::Misused;
+    }
     if solver.method == Method::Adaptive {
         terminal.error("an adaptive run has no fixed step to time; choose one with --solver, such as --solver expo");
         return End::Misused;

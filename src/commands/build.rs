@@ -5,6 +5,7 @@ use crate::args::Build;
 use crate::compile::{self, Emit, Stopwatch};
 use crate::project;
 use crate::terminal::Terminal;
+use grammar::ast::Statement;
 use grammar::diagnostic::Diagnostic;
 use std::path::Path;
 
@@ -46,9 +47,16 @@ pub fn build(args: &Build, terminal: &mut Terminal) -> End {
     let name = match (&args.name, &models[..], &experiments[..]) {
         (Some(name), ..) if all().any(|known| known == name) => name.clone(),
         (Some(name), ..) => {
-            let help = match compile::nearest(name, all()) {
-                Some(near) => format!("did you mean `{near}`?"),
-                None => format!("it has {}", all().collect::<Vec<_>>().join(", ")),
+            let help = match (of_part(&loaded, name), compile::nearest(name, all())) {
+                (Some((owner, model)), _) if models.contains(&model) => {
+                    format!("that is a part of `{owner}`, a `{model}`: `fric build {file} {model}`")
+                }
+                (Some((owner, model)), _) => format!(
+                    "that is a part of `{owner}`, a `{model}` of another file: write `model Mine = {model}()` with its \
+                     arguments into this one, and build `Mine`"
+                ),
+                (None, Some(near)) => format!("did you mean `{near}`?"),
+                (None, None) => format!("it has {}", all().collect::<Vec<_>>().join(", ")),
             };
             terminal.error(&format!("{file} has no model or experiment `{name}`; {help}"));
             return End::Failed;
@@ -81,6 +89,11 @@ pub fn build(args: &Build, terminal: &mut Terminal) -> End {
     if !found.is_empty() {
         reported(&loaded, &found, terminal);
     }
+    let method = built.solver.map(|solver| solver.method).or(args.stepped.solver);
+    if let Some(why) = method.and_then(|method| args.stepped.without_effect(&name, method)) {
+        terminal.error(&why);
+        return End::Misused;
+    }
     let delays = &built.program.description.delays;
     if args.stepped.step.is_none() && compile::unsized_delays(&built, args.stepped.solver) {
         let each = if delays.len() == 1 { "a `delay`".into() } else { format!("{} `delay`s", delays.len()) };
@@ -107,6 +120,18 @@ pub fn build(args: &Build, terminal: &mut Terminal) -> End {
     }
     terminal.report(&format!("wrote {}, {} bytes\n", out.display(), crate::quantity::count(bytes.len() as u64)));
     End::Fine
+}
+
+/// The model that has a part of this name, or of its last segment, and the model of that part.
+fn of_part(loaded: &compile::Loaded, path: &str) -> Option<(String, String)> {
+    let name = path.rsplit('.').next()?;
+    loaded.models().into_iter().find_map(|model| {
+        let part = model.body.iter().find_map(|statement| match statement {
+            Statement::Part(part) if part.name.text == name => Some(part),
+            _ => None,
+        })?;
+        Some((model.name.text.clone(), part.instance.model.text.clone()))
+    })
 }
 
 /// Writes C code and its header into a folder.

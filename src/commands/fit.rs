@@ -58,8 +58,10 @@ pub fn fit(args: &args::Fit, terminal: &mut Terminal) -> End {
     let options = Options { changes, interpret: args.interpret };
     let mut end = End::Fine;
     for name in &names {
-        if one(args, &mut loaded, name, &options, terminal) != End::Fine {
-            end = End::Failed;
+        match one(args, &mut loaded, name, &options, terminal) {
+            End::Fine => {}
+            End::Misused => return End::Misused,
+            End::Failed | End::Stopped => end = End::Failed,
         }
     }
     end
@@ -92,6 +94,11 @@ fn one(args: &args::Fit, loaded: &mut Loaded, name: &str, options: &Options, ter
     };
     if !found.is_empty() && !args.quiet && !args.json {
         reported(loaded, &found, terminal);
+    }
+    let method = compiled.varying.experiment.solver.method;
+    if let Some(why) = args.stepped.without_effect_and(args.tol, name, method) {
+        terminal.error(&why);
+        return End::Misused;
     }
     let begin = Instant::now();
     let runs = Runs::new(compiled);

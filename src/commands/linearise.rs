@@ -20,6 +20,11 @@ use serde_json::{Value, json};
 use std::f64::consts::TAU;
 
 pub fn linearise(args: &Linearise, terminal: &mut Terminal) -> End {
+    let drawn = args.bode.as_ref().is_some_and(|file| file.extension().is_none_or(|ending| ending != "csv"));
+    if let Some(why) = args.look.unused(drawn, "--bode FIG.pdf") {
+        terminal.error(&why);
+        return End::Misused;
+    }
     let Some(mut loaded) = load(&args.file, terminal, &mut Stopwatch::start("read")) else { return End::Failed };
     let ports = Ports {
         inputs: args.inputs.clone(),

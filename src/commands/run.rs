@@ -4,7 +4,7 @@ use super::{Done, End, compiled, done_beside, has_experiment, load, sound};
 use crate::args::{self, Run};
 use crate::commands::shared::cross_check::{Crossed, cross};
 use crate::commands::shared::open::open;
-use crate::compile::{Case, Loaded, Options, Stages, Stopwatch};
+use crate::compile::{self, Case, Changes, Loaded, Method, Options, Stages, Stopwatch};
 use crate::figure::{self, Kept, Recorded};
 use crate::plot::{self, Figure, Kind};
 use crate::recording_files::{self, Format};
@@ -13,7 +13,7 @@ use crate::terminal::{Style, Terminal};
 use crate::timings::Timings;
 use crate::{project, quantity, report};
 use grammar::diagnostic::Diagnostic;
-use runtime::engine::{self, Continue, even_grid};
+use runtime::engine::{self, Cause, Continue, Failure, even_grid};
 use runtime::record::Recording;
 use serde_json::json;
 use std::borrow::Cow;
@@ -55,6 +55,15 @@ pub fn run(args: &Run, timings: &mut Timings, terminal: &mut Terminal) -> End {
         ));
         return End::Misused;
     }
+    let drawn = args.plot.is_some() || args.out.is_some() || by_default;
+    if let Some(why) = args.look.unused(drawn, "--plot FIG.pdf or --out DIR") {
+        terminal.error(&why);
+        return End::Misused;
+    }
+    if args.trust.digits.is_some() && args.json {
+        terminal.error("--digits is for the text, and --json has all of them: leave one of them out");
+        return End::Misused;
+    }
     if let Err(diagnostics) = sound(&loaded, args.json || args.quiet, terminal, &mut watch) {
         if args.json {
             names.iter().for_each(|name| refused(args, &loaded, name, &diagnostics, terminal));
@@ -68,8 +77,10 @@ pub fn run(args: &Run, timings: &mut Timings, terminal: &mut Terminal) -> End {
     // Of several experiments --plot makes one figure.
     let mut together = (names.len() > 1 && args.plot.is_some()).then(Figure::default);
     for name in &names {
-        if experiment(args, &mut loaded, name, &options, &stages, &mut together, timings, terminal) != End::Fine {
-            end = End::Failed;
+        match experiment(args, &mut loaded, name, &options, &stages, &mut together, timings, terminal) {
+            End::Fine => {}
+            End::Misused => return End::Misused,
+            End::Failed | End::Stopped => end = End::Failed,
         }
     }
     if let (Some(figure), Some(path)) = (together, &args.plot) {
@@ -134,6 +145,12 @@ fn experiment(
             return End::Failed;
         }
     };
+    let changed = &args.changed;
+    let method = cases.first().map(|case| case.experiment.solver.method);
+    if let Some(why) = method.and_then(|method| changed.stepped.without_effect_and(changed.tol, name, method)) {
+        terminal.error(&why);
+        return End::Misused;
+    }
     if let (true, Some(case)) = (talking, cases.first()) {
         terminal.line(&terminal.styled(Style::Bold, name));
         let description = case.instance.description();
@@ -150,20 +167,27 @@ fn experiment(
             (args.plot.is_some() && together.is_none(), "--plot"),
             (args.data.is_some() && !records, "--data"),
             (args.every.is_some() && !records, "--every"),
+            (args.thin && !records, "--thin"),
+            (args.look.given().is_some() && args.experiments.len() == 1, args.look.given().unwrap_or("--size")),
         ];
         if let Some((_, option)) = asked.into_iter().find(|(asked, _)| *asked) {
             terminal.error(&format!(
                 "{}: {option} has nothing to write: `{name}` {}",
                 place(loaded, name),
                 match option {
-                    "--plot" => "draws nothing; add `plot` with what to draw, such as `plot x, v`",
+                    option if option == "--plot" || args.look.given() == Some(option) =>
+                        "draws nothing; add `plot` with what to draw, such as `plot x, v`",
                     _ => "records nothing; add `record` with what to record, such as `record x, v`",
                 }
             ));
             return End::Failed;
         }
-        if talking && args.out.is_some() && !records {
-            terminal.line("  nothing to write: the experiment has no `plot` and no `record`");
+        if args.out.is_some() && !records {
+            let words = "nothing to write: the experiment has no `plot` and no `record`";
+            match talking {
+                true => terminal.line(&format!("  {words}")),
+                false => terminal.report(&format!("--out: {words}\n")),
+            }
         }
     }
     let every = |case: &Case| args.every.or(case.experiment.every.filter(|_| !args.thin));
@@ -193,7 +217,9 @@ fn experiment(
     let (done, (drawn, written, of_files)) = done_beside(cases, stages, !talking, errors, files);
     if let (Some(all), Some(figure)) = (together.as_mut(), &drawn) {
         let mut panels = figure.panels.clone();
-        if let Some(first) = panels.first_mut().filter(|first| first.title.is_empty()) {
+        // `--title ""` takes away every heading that the text does not write itself.
+        let named = args.look.title.as_deref() != Some("");
+        if let Some(first) = panels.first_mut().filter(|first| first.title.is_empty() && named) {
             first.title = name.into();
         }
         all.panels.append(&mut panels);
@@ -244,7 +270,8 @@ fn experiment(
     for (case, result) in done.cases.iter().zip(&done.results) {
         if let Err(failure) = result {
             let label = if case.label.is_empty() { String::new() } else { format!(", {}", case.label) };
-            terminal.error(&format!("{}: {name}{label}: {failure}", place(loaded, name)));
+            let cause = too_long(loaded, name, options, case, failure).unwrap_or_default();
+            terminal.error(&format!("{}: {name}{label}: {failure}{cause}", place(loaded, name)));
         }
     }
     match written {
@@ -263,6 +290,33 @@ fn experiment(
             End::Failed
         }
     }
+}
+
+/// Says that the length of its steps made a run leave a range or become infinite: adaptive steps do neither.
+fn too_long(loaded: &mut Loaded, name: &str, options: &Options, case: &Case, failure: &Failure) -> Option<String> {
+    /// The run is given up after this many looks of the engine.
+    const MOST_LOOKS: usize = 2000;
+    let solver = case.experiment.solver;
+    let of_steps = matches!(failure.cause, Cause::Guard { .. } | Cause::NotFinite { .. });
+    if !of_steps || solver.method == Method::Adaptive || case.experiment.bench.is_some() {
+        return None;
+    }
+    let changes = Changes { method: Some(Method::Adaptive), step: None, tol: None, ..options.changes.clone() };
+    let options = Options { changes, ..options.clone() };
+    let cases = compile::compile(loaded, &crate::disk::Disk, name, &options, &mut Vec::new(), &mut |_| ()).ok()?;
+    let other = cases.into_iter().find(|other| other.label == case.label)?;
+    let mut looks = 0;
+    let mut watch = |_| {
+        looks += 1;
+        if looks > MOST_LOOKS { Continue::Break(()) } else { Continue::Continue(()) }
+    };
+    // Beyond the time of the failure the two need not agree.
+    let passed = match engine::run(other.instance, &other.experiment, &mut watch) {
+        Ok(_) => true,
+        Err(other) => other.time > 1.01 * failure.time,
+    };
+    let step = abi::format::time(solver.step);
+    passed.then(|| format!("; by adaptive steps it does not: steps of {step} by {} are too long", solver.method.name()))
 }
 
 /// The position of an experiment in its file.
@@ -373,7 +427,8 @@ fn rows<'a>(
     }
     let (kept, seen) = (recording.rows().len() as u64, recording.seen());
     if kept >= seen {
-        return Ok((Cow::Borrowed(recording), String::new()));
+        let remark = if args.thin { " (every step: `--thin` has nothing to leave out)" } else { "" };
+        return Ok((Cow::Borrowed(recording), remark.into()));
     }
     let of = format!("{} of {} steps", quantity::count(kept), quantity::count(seen));
     if args.thin {

@@ -19,7 +19,7 @@ use crate::plot::{self, Axis};
 use crate::quantity::{self, count, significant};
 use crate::terminal::{Style, Terminal};
 use crate::unfinished::{Hash, Mark, Unfinished};
-use crate::vary::{Dice, Vary};
+use crate::vary::{Dice, How, Vary};
 use crate::{project, results};
 use abi::plan::{Expect, Formula, Measure};
 use abi::unit::Unit;
@@ -47,15 +47,19 @@ pub fn sweep(args: &Sweep, terminal: &mut Terminal) -> End {
         return End::Failed;
     }
     for (k, vary) in args.vary.iter().enumerate() {
-        if args.vary[..k].iter().any(|other| other.path == vary.path) {
-            terminal.error(&format!("`{}` is varied twice; give it one --vary", vary.path));
+        let before = || args.vary[..k].iter().flat_map(Vary::paths);
+        if let Some(twice) = vary.paths().find(|path| before().any(|other| other == *path)) {
+            terminal.error(&format!("`{twice}` is varied twice; give it one --vary"));
             return End::Misused;
         }
-        if args.changed.stepped.set.all.iter().any(|(path, _)| *path == vary.path) {
-            terminal.error(&format!("`{}` is both set and varied; leave out --set or --vary", vary.path));
+        let set = |wanted: &&str| args.changed.stepped.set.all.iter().any(|(path, _)| path == wanted);
+        if let Some(path) = vary.paths().find(set) {
+            terminal.error(&format!("`{path}` is both set and varied; leave out --set or --vary"));
             return End::Misused;
         }
     }
+    let (models, numbers): (Vec<Vary>, Vec<Vary>) =
+        args.vary.iter().cloned().partition(|vary| matches!(vary.how, How::Models(_)));
     let best = match best::read(&args.best) {
         Ok(best) => best,
         Err(message) => {
@@ -63,7 +67,19 @@ pub fn sweep(args: &Sweep, terminal: &mut Terminal) -> End {
             return End::Misused;
         }
     };
-    let Some(cases) = compiled(args, best.as_ref(), &mut loaded, terminal) else { return End::Failed };
+    if let Some(why) = args.look.unused(args.plot.is_some(), "--plot FIG.pdf") {
+        terminal.error(&why);
+        return End::Misused;
+    }
+    let Some(cases) = compiled(args, &models, &numbers, best.as_ref(), &mut loaded, terminal) else {
+        return End::Failed;
+    };
+    let method = cases.first().map(|case| case.experiment.solver.method);
+    let (stepped, tol) = (&args.changed.stepped, args.changed.tol);
+    if let Some(why) = method.and_then(|method| stepped.without_effect_and(tol, &args.experiment, method)) {
+        terminal.error(&why);
+        return End::Misused;
+    }
     if args.vary.is_empty() && cases.len() == 1 {
         terminal.error(&format!(
             "nothing varies: add --vary 'PATH = 1 N .. 2 N by 0.1 N', or a `sweep` to `{}`",
@@ -71,7 +87,7 @@ pub fn sweep(args: &Sweep, terminal: &mut Terminal) -> End {
         ));
         return End::Misused;
     }
-    let table = match SweepTable::new(args, cases, best) {
+    let table = match SweepTable::new(args, numbers, cases, best) {
         Ok(table) => table,
         Err(message) => {
             terminal.error(&message);
@@ -89,32 +105,47 @@ pub fn sweep(args: &Sweep, terminal: &mut Terminal) -> End {
 
 /// The experiment with its parameters variable; a parameter that is computed from others, or has no value, is assigned
 /// one first.
-fn compiled(args: &Sweep, best: Option<&Best>, loaded: &mut Loaded, terminal: &Terminal) -> Option<Vec<Varying>> {
+fn compiled(
+    args: &Sweep,
+    models: &[Vary],
+    numbers: &[Vary],
+    best: Option<&Best>,
+    loaded: &mut Loaded,
+    terminal: &Terminal,
+) -> Option<Vec<Varying>> {
     // What rows are ranked by need not occur in the experiment.
-    let also = best.and_then(|best| best.measure.as_ref()).map(|measure| format!("show {measure}"));
+    let ranked = best.and_then(|best| best.measure.as_ref()).map(|measure| format!("show {measure}"));
+    // Models of a slot are compiled one by one, as those of a `sweep`.
+    let swept = models.iter().filter_map(|vary| match &vary.how {
+        How::Models(models) => Some(format!("sweep {} = {models}", vary.path)),
+        _ => None,
+    });
+    let also = ranked.into_iter().chain(swept);
     let mut options = Options {
         changes: Changes {
-            vary: args.vary.iter().map(|vary| vary.path.clone()).collect(),
-            also: also.into_iter().collect(),
+            vary: numbers.iter().flat_map(Vary::paths).map(str::to_string).collect(),
+            also: also.collect(),
             ..args.changed.changes()
         },
         interpret: args.interpret,
     };
     let name = &args.experiment;
     let first = compile::varying(loaded, &crate::disk::Disk, name, &options, &mut Vec::new());
-    let open = |vary: &&Vary| match &first {
-        Ok(cases) => cases.iter().any(|case| case.param(&vary.path).is_none()),
+    let open = |(_, path): &(&Vary, &str)| match &first {
+        Ok(cases) => cases.iter().any(|case| case.param(path).is_none()),
         Err(_) => true,
     };
-    let missing: Vec<&Vary> = args.vary.iter().filter(open).collect();
+    let all = numbers.iter().flat_map(|vary| vary.paths().map(move |path| (vary, path)));
+    let missing: Vec<(&Vary, &str)> =
+        all.filter(|(vary, _)| !matches!(vary.how, How::Around(..))).filter(open).collect();
     if missing.is_empty()
         && let Ok(cases) = first
     {
         return Some(cases);
     }
-    let shown = |vary: &Vary| {
+    let shown = |(vary, path): (&Vary, &str)| {
         let unit = Some(vary.unit.to_string()).filter(|unit| unit != "1").unwrap_or_default();
-        format!("{}={} {unit}", vary.path, vary.unit.from_si(vary.typical()))
+        format!("{path}={} {unit}", vary.unit.from_si(vary.typical()))
     };
     options.changes.set.extend(missing.into_iter().map(shown));
     match compile::varying(loaded, &crate::disk::Disk, name, &options, &mut Vec::new()) {
@@ -138,8 +169,8 @@ fn rows_of(out: &Path) -> PathBuf {
 struct SweepTable {
     cases: Vec<Varying>,
     vary: Vec<Vary>,
-    /// For each case the slots of the parameters.
-    slots: Vec<Vec<Slot>>,
+    /// For each case, and each of what varies: the slots that take its values, each with a factor.
+    slots: Vec<Vec<Vec<(Slot, f64)>>>,
     /// Combinations of the grids, and draws for each.
     grid: u64,
     draws: u64,
@@ -147,6 +178,52 @@ struct SweepTable {
     columns: Vec<Column>,
     /// The ranking of rows, with the column that ranks them.
     best: Option<(Best, usize)>,
+}
+
+/// Finds the slots of what varies in each case. A share of the values in the text becomes a grid of their unit, or, if
+/// several quantities or cases differ in them, one in percent.
+fn placed(vary: Vary, cases: &[Varying], slots: &mut [Vec<Vec<(Slot, f64)>>]) -> Result<Vary, String> {
+    let (mut values, mut own_unit) = (Vec::new(), None);
+    for (case, slots) in cases.iter().zip(slots.iter_mut()) {
+        let mut of_case = Vec::new();
+        for path in vary.paths() {
+            let Some(param) = case.param(path) else {
+                return Err(match vary.how {
+                    How::Around(..) => format!("`{path}` has no number of its own to vary around: give its values"),
+                    _ => format!(
+                        "`{path}` is neither a parameter nor a state: only parameters and start values of states vary"
+                    ),
+                });
+            };
+            let value = case.params().find(|(quantity, _)| quantity.slot == param.slot).map(|(_, value)| value);
+            values.push((path.to_string(), value.unwrap_or(f64::NAN)));
+            own_unit = own_unit.or(Some(param.unit.clone()));
+            if !matches!(vary.how, How::Around(..)) && param.unit.dimension != vary.unit.dimension {
+                let (wanted, found) = (param.unit.dimension.describe(), vary.unit.dimension.describe());
+                return Err(format!("`{path}` is {wanted}, it cannot be {found}"));
+            }
+            of_case.push((param.slot, 1.0));
+        }
+        slots.push(of_case);
+    }
+    let (How::Around(..), Some((first, middle)), Some(unit)) = (&vary.how, values.first(), own_unit) else {
+        return Ok(vary);
+    };
+    if let Some((path, value)) = values.iter().find(|(_, value)| !(value.is_finite() && *value != 0.0)) {
+        let value = quantity::show(*value, &unit, 6);
+        return Err(format!("`{path}` is {value} in the text, of which there is no share: give its values"));
+    }
+    if values.iter().all(|(path, value)| path == first && value.to_bits() == middle.to_bits()) {
+        return Ok(vary.around(*middle, &unit));
+    }
+    let mut values = values.iter();
+    for of_case in slots.iter_mut().filter_map(|slots| slots.last_mut()) {
+        for ((_, factor), (_, value)) in of_case.iter_mut().zip(&mut values) {
+            *factor = *value;
+        }
+    }
+    let percent = Unit::parse("%").expect("percent is known");
+    Ok(vary.around(1.0, &percent))
 }
 
 /// The file to which rows are appended, and its checkpoint.
@@ -221,27 +298,12 @@ fn window(expect: &Expect, duration: f64) -> (f64, f64) {
 }
 
 impl SweepTable {
-    fn new(args: &Sweep, cases: Vec<Varying>, best: Option<Best>) -> Result<SweepTable, String> {
-        let mut slots = Vec::new();
-        for case in &cases {
-            let mut of_case = Vec::new();
-            for vary in &args.vary {
-                let Some(param) = case.param(&vary.path) else {
-                    return Err(format!(
-                        "`{}` is neither a parameter nor a state: only parameters and start values of states vary",
-                        vary.path
-                    ));
-                };
-                if param.unit.dimension != vary.unit.dimension {
-                    let (wanted, found) = (param.unit.dimension.describe(), vary.unit.dimension.describe());
-                    return Err(format!("`{}` is {wanted}, it cannot be {found}", vary.path));
-                }
-                of_case.push(param.slot);
-            }
-            slots.push(of_case);
-        }
-        let grid = args.vary.iter().filter_map(Vary::len).map(|len| len as u64).product();
-        let random = args.vary.iter().any(|vary| vary.len().is_none());
+    fn new(args: &Sweep, vary: Vec<Vary>, cases: Vec<Varying>, best: Option<Best>) -> Result<SweepTable, String> {
+        let mut slots: Vec<Vec<Vec<(Slot, f64)>>> = cases.iter().map(|_| Vec::new()).collect();
+        let vary: Vec<Vary> =
+            vary.into_iter().map(|vary| placed(vary, &cases, &mut slots)).collect::<Result<_, String>>()?;
+        let grid = vary.iter().filter_map(Vary::len).map(|len| len as u64).product();
+        let random = vary.iter().any(|vary| vary.len().is_none());
         let draws = match (random, args.runs) {
             (true, runs) => runs.unwrap_or(DEFAULT_RUNS),
             (false, None | Some(1)) => 1,
@@ -249,7 +311,10 @@ impl SweepTable {
                 return Err("--runs is for distributions, such as --vary 'm ~ normal(1 kg, 0.1 kg)'".into());
             }
         };
-        let columns = columns(&cases, &args.vary);
+        if !random && args.seed.is_some() {
+            return Err("--seed is for distributions, such as --vary 'm ~ normal(1 kg, 0.1 kg)'".into());
+        }
+        let columns = columns(&cases, &vary);
         let best = match best {
             Some(best) => {
                 let column = best.column(&columns)?;
@@ -257,7 +322,7 @@ impl SweepTable {
             }
             None => None,
         };
-        Ok(SweepTable { cases, vary: args.vary.clone(), slots, grid, draws, seed: args.seed, columns, best })
+        Ok(SweepTable { cases, vary, slots, grid, draws, seed: args.seed.unwrap_or(1), columns, best })
     }
 
     fn total(&self) -> u64 {
@@ -273,7 +338,7 @@ impl SweepTable {
         let mut k = 0;
         for (vary, value) in self.vary.iter().zip(&mut values) {
             match &vary.how {
-                crate::vary::How::Values(all) => {
+                How::Values(all) => {
                     stride /= all.len() as u64;
                     *value = all[(left / stride) as usize];
                     left %= stride;
@@ -349,7 +414,10 @@ impl SweepTable {
     /// A run with its values; or the row of a run that its values do not allow.
     fn fitted(&self, number: u64, dice: &Dice) -> Result<(SweepRun, PreparedRun), Vec<u8>> {
         let (at, values) = self.values(number, dice);
-        let given: Vec<(Slot, f64)> = self.slots[at].iter().copied().zip(values.iter().copied()).collect();
+        let of = |(slots, value): (&Vec<(Slot, f64)>, &f64)| {
+            slots.iter().map(|(slot, factor)| (*slot, factor * value)).collect::<Vec<_>>()
+        };
+        let given: Vec<(Slot, f64)> = self.slots[at].iter().zip(&values).flat_map(of).collect();
         let description = |fitted: &PreparedRun| fitted.instance.description().clone();
         match self.cases[at].at(&given) {
             Ok(fitted) => Ok((SweepRun { number, at, values, description: description(&fitted) }, fitted)),
@@ -625,12 +693,15 @@ impl SweepTable {
         let mut asked = format!("fric {}, texts {texts:016x}\n", env!("CARGO_PKG_VERSION"));
         let solver = results::solver(&self.cases[0].experiment.solver);
         asked += &format!("{} with {solver} for {} s\n", args.experiment, self.cases[0].experiment.duration);
+        for vary in args.vary.iter().filter(|vary| matches!(vary.how, How::Models(_))) {
+            asked += &format!("--vary {}: {:?}\n", vary.path, vary.how);
+        }
         for set in args.changed.stepped.set.texts() {
             asked += &format!("--set {set}\n");
         }
         for vary in &self.vary {
             let how = match &vary.how {
-                crate::vary::How::Values(values) => {
+                How::Values(values) => {
                     format!("{} values, {:?} .. {:?}", values.len(), values[0], values[values.len() - 1])
                 }
                 how => format!("{how:?}"),
