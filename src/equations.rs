@@ -4,8 +4,8 @@
 //! exponents, and bars for `abs`.
 
 use grammar::ast::{
-    BinaryOp, DeclarationKind, Equation, Every, EveryStatement, Expr, ExprKind, Model, Path, Reset, Statement, Target,
-    UnaryOp,
+    BinaryOp, DeclarationKind, Equation, Every, EveryStatement, Expr, ExprKind, Mode, Model, Path, Reset, Statement,
+    Target, UnaryOp,
 };
 
 /// The equations of a model, left and right side, in the order of the text. Each regime has a heading, with an empty
@@ -30,15 +30,24 @@ pub fn equations(model: &Model) -> Vec<(String, String)> {
             }
             Statement::Every(every) => sampled(every, &mut lines),
             Statement::Mode(mode) => {
-                lines.push((format!("in {}:", mode.name.text), String::new()));
+                // Regimes with the same equations are told together, where the first of them stands.
+                let same = together(model, mode);
+                if same.first().is_none_or(|first| !std::ptr::eq(*first, mode)) {
+                    continue;
+                }
+                let names: Vec<&str> = same.iter().map(|mode| mode.name.text.as_str()).collect();
+                lines.push((format!("in {}:", names.join(", ")), String::new()));
                 lines.extend(mode.equations.iter().map(sides));
-                for go in &mode.transitions {
-                    let resets = match &go.resets[..] {
-                        [] => String::new(),
-                        some => format!(", then {}", reset(some)),
-                    };
-                    let condition = expression(&go.condition);
-                    lines.push((format!("→ {}", go.target.text), format!("when {condition}{resets}")));
+                for mode in &same {
+                    let from = if same.len() > 1 { format!("{} ", mode.name.text) } else { String::new() };
+                    for go in &mode.transitions {
+                        let resets = match &go.resets[..] {
+                            [] => String::new(),
+                            some => format!(", then {}", reset(some)),
+                        };
+                        let condition = expression(&go.condition);
+                        lines.push((format!("{from}→ {}", go.target.text), format!("when {condition}{resets}")));
+                    }
                 }
             }
             Statement::When(when) => {
@@ -50,6 +59,17 @@ pub fn equations(model: &Model) -> Vec<(String, String)> {
     lines
 }
 
+/// The regimes of a model with the equations of this one, itself among them.
+fn together<'a>(model: &'a Model, mode: &Mode) -> Vec<&'a Mode> {
+    let written = |mode: &Mode| mode.equations.iter().map(sides).collect::<Vec<_>>();
+    let own = written(mode);
+    let modes = model.body.iter().filter_map(|statement| match statement {
+        Statement::Mode(mode) => Some(mode),
+        _ => None,
+    });
+    modes.filter(|other| written(other) == own).collect()
+}
+
 /// The resets of a transition: `slip := 0, Ea := left`.
 fn reset(resets: &[Reset]) -> String {
     let one = |reset: &Reset| format!("{} := {}", symbol(&reset.name.text), expression(&reset.value));
@@ -58,10 +78,12 @@ fn reset(resets: &[Reset]) -> String {
 
 /// One line for each equation, aligned at the equals signs.
 pub fn lines(equations: &[(String, String)]) -> String {
-    let width = equations.iter().filter(|(_, right)| !right.is_empty()).map(|(left, _)| left.chars().count()).max();
+    let aligned =
+        |(left, right): &&(String, String)| !(right.is_empty() || left.contains('→') || left.starts_with("when"));
+    let width = equations.iter().filter(aligned).map(|(left, _)| left.chars().count()).max();
     let mut text = String::new();
     for (left, right) in equations {
-        match (right.is_empty(), left.starts_with('→') || left.starts_with("when")) {
+        match (right.is_empty(), left.contains('→') || left.starts_with("when")) {
             (true, _) => text += &format!("{left}\n"),
             (false, true) => text += &format!("{left} {right}\n"),
             (false, false) => text += &format!("{left:width$} = {right}\n", width = width.unwrap_or(0).min(12)),

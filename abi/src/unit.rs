@@ -273,6 +273,14 @@ const PREFIXES: &[(&str, f64)] = &[("G", 1e9), ("M", 1e6), ("k", 1e3), ("m", 1e-
 /// Largest exponent of a factor as written: no real unit needs a larger one.
 const MOST_EXPONENT: u32 = 99;
 
+/// The symbols of all units, with all their prefixes.
+pub fn symbols() -> impl Iterator<Item = String> {
+    UNITS.iter().flat_map(|(symbol, _, _, prefixed, _)| {
+        let with = PREFIXES.iter().filter(|_| *prefixed).map(move |(prefix, _)| format!("{prefix}{symbol}"));
+        std::iter::once((*symbol).to_string()).chain(with)
+    })
+}
+
 impl Unit {
     /// Dimensionless.
     pub fn none() -> Unit {
