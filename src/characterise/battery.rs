@@ -25,10 +25,72 @@ pub struct Scales {
     pub f_c: f64,
     /// Speed at which the excess over `f_c` has decayed to 1/e; else a hundredth of the greatest speed.
     pub v_s: f64,
+    /// Force per displacement at a tenth of `f_b`; infinite for a contact that does not move before it slides.
+    pub stiffness: f64,
     /// Speed that counts as sliding.
     pub v_slip: f64,
     /// Greatest speed of the grid.
     pub v_max: f64,
+}
+
+/// The scales of one bench for several members of a family: the middle between the least and the greatest in ratio.
+pub fn family(members: &[&Scales]) -> Option<Scales> {
+    let first = members.first()?;
+    let middle = |of: fn(&Scales) -> f64| {
+        let ends = members.iter().map(|member| of(member));
+        let (low, high) = ends.fold((f64::INFINITY, 0.0_f64), |(low, high), x| (low.min(x), high.max(x)));
+        // Members of one value keep its bits.
+        if low == high { low } else { root(low * high) }
+    };
+    let f_ref = middle(|scales| scales.f_ref);
+    Some(Scales {
+        f_ref,
+        mass: power_near(f_ref),
+        f_b: middle(|scales| scales.f_b),
+        x_b: middle(|scales| scales.x_b),
+        travel: middle(|scales| scales.travel),
+        f_c: middle(|scales| scales.f_c),
+        v_s: middle(|scales| scales.v_s),
+        stiffness: members.iter().map(|member| member.stiffness).fold(f64::INFINITY, f64::min),
+        v_slip: 0.0,
+        v_max: first.v_max,
+    })
+}
+
+/// The speed from which each of these contacts slides, on one bench. Sliding is ten times the Stribeck speed: 10 mm/s
+/// for the textbook's 1 mm/s. A mass that oscillates on a contact which still holds does not slide: under a ramp of rate
+/// r it oscillates with up to 2 r/k.
+pub fn sliding_speed(members: &[&Scales], bench: &Layout) -> f64 {
+    let fastest = bench.rates().into_iter().fold(0.0, f64::max);
+    let one = |scales: &&Scales| (10.0 * scales.v_s).max(4.0 * fastest / scales.stiffness);
+    round(members.iter().map(one).fold(0.0, f64::max))
+}
+
+/// The path of a slow force on the presliding bench: to its amplitude and to and fro, so that the last loop is closed,
+/// and for a large one an inner loop after it.
+pub struct Presliding {
+    /// Amplitude of the force.
+    pub amplitude: f64,
+    /// Its rate.
+    pub rate: f64,
+    stops: Vec<f64>,
+}
+
+impl Presliding {
+    /// Begin and end of the closed loop, s: from the amplitude to its negative and back, after one such loop and a half.
+    pub fn loop_times(&self) -> (f64, f64) {
+        (self.time(5.0), self.time(9.0))
+    }
+
+    /// The inner loop, s: at half of the amplitude on the way up, at its turn at no force, and back.
+    pub fn inner_times(&self) -> [f64; 3] {
+        [12.5, 13.0, 13.5].map(|path| self.time(path))
+    }
+
+    /// The time at which the force has travelled a path, in amplitudes.
+    fn time(&self, path: f64) -> f64 {
+        path * self.amplitude / self.rate
+    }
 }
 
 /// Names of units.
@@ -72,6 +134,9 @@ impl Units {
         if rotary { ROTARY } else { STRAIGHT }
     }
 }
+
+/// Path in break-away travels after which a contact has forgotten its start: e^−30 is 1e-13.
+const FORGOTTEN: f64 = 30.0;
 
 /// The experiment on drift: when its oscillation has become periodic, and its end, s.
 pub const DRIFT: (f64, f64) = (12.0, 32.0);
@@ -210,13 +275,47 @@ pub struct Layout<'a> {
     subject: &'a Subject,
     /// Units of the model.
     pub units: Units,
+    /// Those of the model.
     scales: Scales,
+    /// Those for which its benches are laid out: the same, unless several models share them.
+    bench: Scales,
 }
 
 impl<'a> Layout<'a> {
     /// A generator with the scales known so far.
     pub fn new(subject: &'a Subject, scales: Scales) -> Layout<'a> {
-        Layout { subject, units: Units::of(subject.rotary), scales }
+        Layout { subject, units: Units::of(subject.rotary), bench: scales.clone(), scales }
+    }
+
+    /// The same on a bench with other scales.
+    pub fn on(self, bench: Scales) -> Layout<'a> {
+        Layout { bench, ..self }
+    }
+
+    /// The scales for which the benches are laid out.
+    pub fn bench(&self) -> &Scales {
+        &self.bench
+    }
+
+    /// The force on the presliding bench, to a part of the break-away force.
+    pub fn presliding(&self, part: f64) -> Presliding {
+        let a = round_down(part * self.scales.f_b);
+        let mut stops = vec![0.0, a, -a, a, -a, a];
+        if part > 0.5 {
+            stops.extend([-a, 0.5 * a, 0.0, a]);
+        }
+        Presliding { amplitude: a, rate: round(0.2 * self.scales.f_b), stops }
+    }
+
+    /// Cycles of the test of losses at this amplitude; the last is measured.
+    pub fn cycles(&self, amplitude: f64) -> f64 {
+        self.rounds(4.0 * amplitude) + 1.0
+    }
+
+    /// Rounds of an oscillation with a path of this length a round, until the contact has forgotten its start: its
+    /// transient along the path has decayed as in [`Layout::steady`].
+    fn rounds(&self, path: f64) -> f64 {
+        (FORGOTTEN * self.scales.x_b / path).ceil().clamp(2.0, 200.0)
     }
 
     /// The model's own regimes.
@@ -241,7 +340,7 @@ impl<'a> Layout<'a> {
 
     fn force_bench(&self, u: &str, more: &str) -> String {
         let Units { bench, mass, .. } = self.units;
-        format!("{bench}ForceBench(u = {u}, m = {} {mass}{more}, fr = {})", n(self.scales.mass), self.pushed())
+        format!("{bench}ForceBench(u = {u}, m = {} {mass}{more}, fr = {})", n(self.bench.mass), self.pushed())
     }
 
     fn speed_bench(&self, v: &str) -> String {
@@ -258,10 +357,12 @@ impl<'a> Layout<'a> {
             self.speed_bench("speed")
         );
         if self.scales.f_b > 0.0 {
-            let d = round(0.01 * self.scales.f_b / self.scales.v_s);
+            let d = round(0.01 * self.bench.f_b / self.bench.v_s);
             let _ = write!(
                 text,
-                "\n/// A mass with a little damping from outside, so that what is seen is the contact\n\
+                "\n/// From 0 to 1 within a time, along half a cosine.\n\
+                 fn eased(now [s], begin [s], length [s]) = (1 - cos(pi * clamp((now - begin) / length, 0, 1))) / 2\n\n\
+                 /// A mass with a little damping from outside, so that what is seen is the contact\n\
                  /// and not the ringing of a mass on a spring without loss.\n\
                  model Damped {{\n  input  u [{force}]\n  param  d = {} {damping}\n  part   bench = {}\n\
                  \x20 output F [{force}] = bench.F\n  output x [{length}] = bench.x\n  output v [{speed}] = bench.v\n}}\n",
@@ -309,8 +410,7 @@ impl<'a> Layout<'a> {
             let grid = if k == 0 { &GRID[..1] } else { &GRID[..] };
             let speeds = grid.iter().flat_map(|g| [g * low, -g * low]).map(|v| format!("{} {speed}", n(v)));
             let speeds: Vec<String> = speeds.collect();
-            // The transient along the path decays to e^−30, 1e-13 of its start.
-            let travel = (30.0 * self.scales.x_b).max(1e-3 * self.scales.v_max);
+            let travel = (FORGOTTEN * self.scales.x_b).max(1e-3 * self.scales.v_max);
             let mut entry = Entry::new(
                 format!("steady_{}", 7 - k),
                 format!("Steady friction from {} {speed} on, both directions.", n(low)),
@@ -325,21 +425,20 @@ impl<'a> Layout<'a> {
 
     /// Rates of the break-away ramps: three decades.
     pub fn rates(&self) -> Vec<f64> {
-        let unit = power_near(self.scales.f_ref);
+        let unit = power_near(self.bench.f_ref);
         [0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0].map(|rate| rate * unit).to_vec()
     }
 
     /// Frequencies of the lag loops in Hz.
     pub fn lag_frequencies(&self) -> [f64; 3] {
-        let middle =
-            if self.scales.x_b > 1e-4 * self.scales.v_s { self.scales.v_s / self.scales.x_b / 60.0 } else { 1.0 };
+        let middle = if self.bench.x_b > 1e-4 * self.bench.v_s { self.bench.v_s / self.bench.x_b / 60.0 } else { 1.0 };
         let middle = power_near(middle.clamp(0.1, 10.0));
         [0.1 * middle, middle, 10.0 * middle]
     }
 
     /// Speeds of the far end of the spring.
     pub fn pull_speeds(&self) -> Vec<f64> {
-        let unit = power_near(self.scales.f_b / self.scales.mass * 0.07);
+        let unit = power_near(self.bench.f_b / self.bench.mass * 0.07);
         [0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0].map(|speed| speed * 10.0 * unit).to_vec()
     }
 
@@ -351,7 +450,7 @@ impl<'a> Layout<'a> {
 
     /// A path that shows whether friction depends on the path's history.
     pub fn path(&self) -> f64 {
-        round(self.scales.x_b.max(1e-3 * self.scales.v_s))
+        round(self.bench.x_b.max(1e-3 * self.bench.v_s))
     }
 
     /// The steps of the step-size sweep in s.
@@ -361,15 +460,15 @@ impl<'a> Layout<'a> {
 
     /// Speed of the cycles on a path.
     pub fn cycle_speed(&self) -> f64 {
-        round(0.1 * self.scales.v_s)
+        round(0.1 * self.bench.v_s)
     }
 
     /// Everything after the scales and the steady curve.
     pub fn rest(&self) -> Vec<Entry> {
         let mut entries = Vec::new();
         let Units { force, length, speed, rate, stiffness, mass, .. } = self.units;
-        let s = &self.scales;
-        let (f_b, m) = (s.f_b, s.mass);
+        let (s, bench) = (&self.scales, &self.bench);
+        let (f_b, m) = (s.f_b, bench.mass);
         let motion = |entry: Entry| {
             entry.plot(format!("F [{force}]")).plot(format!("x [{length}]")).plot(format!("v [{speed}]"))
         };
@@ -392,12 +491,9 @@ impl<'a> Layout<'a> {
         }
 
         for (name, part) in [("small", 0.3), ("large", 0.95)] {
-            let (a, r) = (round_down(part * f_b), round(0.2 * f_b));
-            let at = |stops: &[f64]| triangle(stops, r, force, rate);
-            let (u, duration) = match name {
-                "small" => at(&[0.0, a, -a, a]),
-                _ => at(&[0.0, a, -a, 0.5 * a, 0.0, a]),
-            };
+            let path = self.presliding(part);
+            let (u, duration) = eased(&path.stops, path.rate, force);
+            let (from, to) = path.loop_times();
             entries.push(
                 motion(Entry::new(
                     format!("presliding_{name}"),
@@ -405,13 +501,15 @@ impl<'a> Layout<'a> {
                     format!("Damped(u = {u})"),
                     duration,
                 ))
-                .solver("adaptive tol 1e-8"),
+                .solver("adaptive tol 1e-8")
+                .expect(format!("integral(F * v) >= 0 J after {} s before {} s", n(from), n(to))),
             );
         }
 
         for (i, f) in self.lag_frequencies().into_iter().enumerate() {
-            let v = format!("{} {speed} + sine({} {speed}, {} Hz)", n(1.5 * s.v_s), n(s.v_s), n(f));
-            let run_in = 200.0 * s.x_b / (1.5 * s.v_s);
+            let v_s = bench.v_s;
+            let v = format!("{} {speed} + sine({} {speed}, {} Hz)", n(1.5 * v_s), n(v_s), n(f));
+            let run_in = 200.0 * s.x_b / (1.5 * v_s);
             let cycles = (run_in * f).ceil() + 2.0;
             entries.push(
                 Entry::new(
@@ -458,16 +556,17 @@ impl<'a> Layout<'a> {
 
         for (i, x) in self.amplitudes().into_iter().enumerate() {
             let f = round(v / (2.0 * std::f64::consts::PI * x));
+            let cycles = self.cycles(x);
             entries.push(
                 Entry::new(
                     format!("energy_{}", i + 1),
                     format!("Loss of a cycle of {} {length} to either side.", n(x)),
                     self.speed_bench(&format!("sine({} {speed}, {} Hz)", n(2.0 * std::f64::consts::PI * f * x), n(f))),
-                    3.0 / f,
+                    cycles / f,
                 )
                 .plot(format!("F [{force}]"))
                 .plot(format!("x [{length}]"))
-                .expect(format!("integral(F * v) >= 0 J after {} s", n(2.0 / f))),
+                .expect(format!("integral(F * v) >= 0 J after {} s", n((cycles - 1.0) / f))),
             );
         }
 
@@ -475,7 +574,7 @@ impl<'a> Layout<'a> {
             let part = |k: u32| {
                 // Speeds over two decades by a fixed rule: the same motions everywhere.
                 let turn = f64::from((seed * 7 + k * 5 + 3) % 11) / 10.0;
-                round(0.3 * s.v_s * (1.0 + 99.0 * turn * turn * turn))
+                round(0.3 * bench.v_s * (1.0 + 99.0 * turn * turn * turn))
             };
             let v = format!(
                 "sine({} {speed}, 1 Hz) + sine({} {speed}, 2 Hz) - sine({} {speed}, 5 Hz)",
@@ -483,16 +582,18 @@ impl<'a> Layout<'a> {
                 n(part(1)),
                 n(part(2))
             );
+            // The mean of |v| is at least half of the greatest amplitude.
+            let rounds = self.rounds(0.5 * part(0).max(part(1)).max(part(2)));
             entries.push(
                 Entry::new(
                     format!("closed_path_{}", seed + 1),
-                    "An irregular motion on a closed path: its second round takes no energy out of the contact.",
+                    "An irregular motion on a closed path: its last round takes no energy out of the contact.",
                     self.speed_bench(&v),
-                    2.0,
+                    rounds + 1.0,
                 )
                 .plot(format!("F [{force}]"))
                 .plot(format!("v [{speed}]"))
-                .expect("integral(F * v) >= 0 J after 1 s".into()),
+                .expect(format!("integral(F * v) >= 0 J after {} s", n(rounds))),
             );
         }
 
@@ -517,7 +618,7 @@ impl<'a> Layout<'a> {
             entries.push(shaded(pulled, "fr"));
         }
 
-        let v0 = round(s.f_c.max(0.1 * f_b) / m);
+        let v0 = round(bench.f_c.max(0.1 * bench.f_b) / m);
         let thrown = motion(Entry::new(
             "coast_down",
             format!("Thrown at {} {speed}, left alone.", n(v0)),
@@ -588,21 +689,20 @@ impl<'a> Layout<'a> {
     }
 }
 
-/// A force that passes through `stops` at a constant rate, and the duration.
-fn triangle(stops: &[f64], rate: f64, force: &str, per_second: &str) -> (String, f64) {
-    let (mut text, mut at, mut slope) = (String::new(), 0.0, 0.0);
+/// A force that passes through `stops` at a mean rate, slowly at each of them, so that no mass rings where the force turns;
+/// and the duration.
+fn eased(stops: &[f64], rate: f64, force: &str) -> (String, f64) {
+    let (mut text, mut at) = (String::new(), 0.0);
     for pair in stops.windows(2) {
-        let next = if pair[1] > pair[0] { rate } else { -rate };
-        let change: f64 = next - slope;
+        let (change, time) = (pair[1] - pair[0], (pair[1] - pair[0]).abs() / rate);
         let sign = match (text.is_empty(), change > 0.0) {
             (true, true) => "",
             (true, false) => "-",
             (false, true) => " + ",
             (false, false) => " - ",
         };
-        let _ = write!(text, "{sign}ramp({} s, 0 {force}, {} {per_second})", n(at), n(change.abs()));
-        slope = next;
-        at += (pair[1] - pair[0]).abs() / rate;
+        let _ = write!(text, "{sign}{} {force} * eased(t, {} s, {} s)", n(change.abs()), n(at), n(time));
+        at += time;
     }
     (text, at)
 }
@@ -641,9 +741,9 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_triangle_is_a_sum_of_ramps() {
-        let (text, end) = triangle(&[0.0, 1.0, -1.0], 0.5, "N", "N/s");
-        assert_eq!(text, "ramp(0 s, 0 N, 0.5 N/s) - ramp(2 s, 0 N, 1 N/s)");
+    fn a_path_is_a_sum_of_eased_steps() {
+        let (text, end) = eased(&[0.0, 1.0, -1.0], 0.5, "N");
+        assert_eq!(text, "1 N * eased(t, 0 s, 2 s) - 2 N * eased(t, 2 s, 4 s)");
         assert_eq!(end, 6.0);
     }
 

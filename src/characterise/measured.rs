@@ -47,7 +47,7 @@ impl Number {
 }
 
 /// Numbers that are ratios, shown in percent.
-const PARTS: [&str; 4] = ["break_away_change", "loop_area", "memory_error", "rate_difference_part"];
+const PARTS: [&str; 5] = ["break_away_change", "loop_area", "loop_gap", "memory_error", "rate_difference_part"];
 
 /// A measured value in SI for people: four digits, and a suitable prefix. A value at the level of rounding errors is
 /// shown as 0, in the smallest unit that would have been used.

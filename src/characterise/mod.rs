@@ -20,6 +20,8 @@ pub mod page;
 
 pub mod latex;
 
+#[cfg(test)]
+pub use measured::Test;
 pub use measured::shown;
 pub use phenomena::Seen;
-pub use study::{Extent, Study, drawn, study};
+pub use study::{Extent, Study, drawn, family, study};

@@ -116,6 +116,9 @@ pub fn comparison(studies: &[Study]) -> String {
         escaped(&studies.iter().map(|study| study.label.as_str()).collect::<Vec<_>>().join(", ")),
         env!("CARGO_PKG_VERSION")
     );
+    if let Some(bench) = studies.iter().find_map(|study| study.bench.as_ref()) {
+        let _ = writeln!(body, "<p class=\"note\">{}.</p>", words(&capital(bench)));
+    }
     for study in studies {
         for note in &study.notes {
             let _ = writeln!(body, "<p class=\"note\">{}: {}</p>", escaped(&study.label), words(note));
@@ -312,7 +315,7 @@ fn scales(study: &Study) -> String {
     let _ = write!(
         out,
         "<tr><td>mass on the benches</td><td class=\"n\">{} {}</td></tr>\n</table>\n",
-        significant(study.scales.mass, 3),
+        significant(study.mass, 3),
         study.units.mass.replace("^2", "²")
     );
     out
@@ -360,7 +363,7 @@ fn class(seen: Seen) -> &'static str {
     match seen {
         Seen::Shown => "yes",
         Seen::NotShown => "no",
-        Seen::NotApplicable | Seen::NotRun => "na",
+        Seen::NotApplicable | Seen::NotRun | Seen::NotProven => "na",
     }
 }
 
@@ -370,7 +373,14 @@ fn mark(seen: Seen) -> &'static str {
         Seen::NotShown => "<span class=\"mark\">✗</span>",
         Seen::NotApplicable => "<span class=\"mark\">–</span>",
         Seen::NotRun => "<span class=\"mark\">?</span>",
+        Seen::NotProven => "<span class=\"mark\">○</span>",
     }
+}
+
+/// A sentence from a clause.
+fn capital(clause: &str) -> String {
+    let mut letters = clause.chars();
+    letters.next().map_or(String::new(), |first| first.to_uppercase().chain(letters).collect())
 }
 
 fn escaped(text: &str) -> String {

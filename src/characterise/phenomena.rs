@@ -6,6 +6,7 @@
 use super::battery::Scales;
 use super::measured::{Number, Test, plain};
 use super::subject::{External, Subject};
+use crate::compile::Verdict;
 
 /// A phenomenon and whether the model shows it.
 #[derive(Clone, PartialEq, Debug)]
@@ -31,6 +32,8 @@ pub enum Seen {
     NotApplicable,
     /// It was not seen, but its experiment could not be run as it is: a fixed step took its place.
     NotRun,
+    /// It holds in every run, which is no proof.
+    NotProven,
 }
 
 impl Seen {
@@ -41,6 +44,7 @@ impl Seen {
             Seen::NotShown => "not shown",
             Seen::NotApplicable => "not applicable",
             Seen::NotRun => "could not be run",
+            Seen::NotProven => "not proven",
         }
     }
 
@@ -51,20 +55,23 @@ impl Seen {
             Seen::NotShown => "not-shown",
             Seen::NotApplicable => "not-applicable",
             Seen::NotRun => "not-run",
+            Seen::NotProven => "not-proven",
         }
     }
 }
 
-/// All findings, in the order of the table. `stepped`: experiments that could not be run adaptively and were run with a
+/// All findings, in the order of the table. `dissipation`: the verdict of the analysis that `fric check` and `fric
+/// explain` report too, none for rotary motion; `stepped`: experiments that could not be run adaptively and were run with a
 /// fixed step instead; `chatter`: what turned without end in them.
 pub fn findings(
     subject: &Subject,
     scales: &Scales,
     tests: &[Test],
+    dissipation: Option<Verdict>,
     stepped: &[String],
     chatter: Option<&str>,
 ) -> Vec<Finding> {
-    let look = Looked { subject, scales, tests, stepped, chatter };
+    let look = Looked { subject, scales, tests, dissipation, stepped, chatter };
     vec![
         look.finding("holds", "holds a load at rest", Looked::holds),
         look.finding("no_drift", "keeps its place when shaken", Looked::no_drift),
@@ -87,6 +94,7 @@ struct Looked<'a> {
     subject: &'a Subject,
     scales: &'a Scales,
     tests: &'a [Test],
+    dissipation: Option<Verdict>,
     stepped: &'a [String],
     chatter: Option<&'a str>,
 }
@@ -287,7 +295,12 @@ impl Looked<'_> {
         }
         let area = self.test("presliding").ok().and_then(|test| Self::number(test, "loop_area"));
         let Some(area) = area else { return (Seen::NotApplicable, "not measured".into()) };
-        when(area.value > 0.005, format!("the loop fills {} of its box", area.shown()))
+        let gap = self.test("presliding").ok().and_then(|test| Self::number(test, "loop_gap"));
+        let open = match gap.filter(|gap| gap.value > 0.01) {
+            Some(gap) => format!(", and moves on by {} of its travel", gap.shown()),
+            None => String::new(),
+        };
+        when(area.value > 0.005, format!("the loop fills {} of its box{open}", area.shown()))
     }
 
     fn memory(&self) -> Answer {
@@ -295,7 +308,7 @@ impl Looked<'_> {
         match hysteresis {
             Seen::Shown => {}
             Seen::NotShown => return (Seen::NotApplicable, format!("elastic, so every loop closes: {why}")),
-            Seen::NotApplicable | Seen::NotRun => return (Seen::NotApplicable, why),
+            Seen::NotApplicable | Seen::NotRun | Seen::NotProven => return (Seen::NotApplicable, why),
         }
         let error = self.test("presliding").ok().and_then(|test| Self::number(test, "memory_error"));
         let Some(error) = error else { return (Seen::NotApplicable, "not measured".into()) };
@@ -367,7 +380,11 @@ impl Looked<'_> {
                 when(true, format!("up to {}, smooth from {} on", up_to.shown(), gone.shown()))
             }
             (Some(up_to), None) => when(true, format!("up to {}, the fastest pull", up_to.shown())),
-            (None, _) => when(false, "slides without sticking at every pull speed".into()),
+            (None, _) => {
+                let ends = [Self::number(test, "slowest_pull"), Self::number(test, "fastest_pull")];
+                let [slowest, fastest] = ends.map(|end| end.map_or("?".into(), Number::shown));
+                when(false, format!("slides without sticking at every pull speed from {slowest} to {fastest}"))
+            }
         }
     }
 
@@ -391,29 +408,23 @@ impl Looked<'_> {
             Err(answer) => return answer,
         };
         let Some(least) = Self::number(test, "least_work") else { return (Seen::NotApplicable, "not measured".into()) };
-        if let (Some(v), Some(force)) = (Self::number(test, "pushes_at"), Self::number(test, "pushes_with")) {
-            return when(false, format!("can push: at v = {} with F = {}", v.shown(), force.shown()));
+        let told = match &self.dissipation {
+            Some(verdict) => verdict.words(),
+            None => "not proven: the analysis is for straight motion".into(),
+        };
+        if let Some(Verdict::Fails(_)) = self.dissipation {
+            return when(false, told);
         }
         // Smaller values are rounding errors of the sum over the steps of a run.
         let greatest = Self::number(test, "greatest_work").map_or(0.0, |number| number.value);
         if least.value < -1e-9 * greatest {
             return when(false, format!("gives out {} on a closed path", least.shown()));
         }
-        if Self::number(test, "dissipation_proved").is_some() {
-            return when(true, format!("proved; least work of a round {}", least.shown()));
-        }
-        match Self::number(test, "dissipation_points") {
-            Some(points) => {
-                when(true, format!("holds at {} points; least work of a round {}", points.value, least.shown()))
-            }
-            None => when(
-                true,
-                format!(
-                    "least work of six rounds {}; not proven: that needs a `storage` and ranges of its states",
-                    least.shown()
-                ),
-            ),
-        }
+        let seen = match self.dissipation {
+            Some(Verdict::Proved) => Seen::Shown,
+            _ => Seen::NotProven,
+        };
+        (seen, format!("{told}; least work of six closed paths {}", least.shown()))
     }
 
     fn symmetric(&self) -> Answer {

@@ -26,6 +26,10 @@ pub struct Study {
     pub battery: String,
     /// Scales, SI.
     pub scales: Scales,
+    /// Mass on the benches, SI.
+    pub mass: f64,
+    /// The bench that it shares with the other members of a family, in words.
+    pub bench: Option<String>,
     /// In the order of the report.
     pub tests: Vec<Test>,
     /// The phenomena that it shows.
@@ -109,127 +113,200 @@ pub fn drawn(study: &Study, key: &str) -> Option<Figure> {
     moved.then(|| figure(&[(0, &study.label, graph)], 1))
 }
 
-/// Characterises a model.
+/// Characterises a model, on benches that are laid out for it.
 ///
 /// # Errors
 /// Why nothing can be measured, as a message or a report.
 pub fn study(subject: Subject, name: &str, sources: &(dyn Sources + Sync), extent: Extent) -> Result<Study, String> {
-    let rotary = subject.rotary;
-    let mut runner = Runner {
-        subject: &subject,
-        name,
-        sources,
-        entries: Vec::new(),
-        results: Results::new(),
-        chatter: None,
-        slow: false,
-    };
-    // Rotary twins of translational models keep their numbers; models written for shafts run faster.
-    let v_max = if rotary && !subject.instance.is_rotary() { 10.0 } else { 1.0 };
-    let mut scales = Scales {
-        f_ref: 0.0,
-        mass: 1.0,
-        f_b: 0.0,
-        x_b: 0.0,
-        travel: 0.0,
-        f_c: 0.0,
-        v_s: 0.01 * v_max,
-        v_slip: 0.01 * v_max,
-        v_max,
-    };
+    Scaled::new(subject, name, sources)?.study(None, extent)
+}
 
-    runner.run(&scales, |layout| vec![layout.scale_sliding()])?;
-    let sliding = runner.one("scale_sliding")?.rows().map_err(|why| format!("does not slide steadily: {why}"))?;
-    scales.f_ref = sliding.last().map_or(0.0, |row| row[1].abs());
-    if scales.f_ref.is_nan() || scales.f_ref <= 0.0 {
-        return Err("gives no force when it slides, so there is nothing to characterise".into());
-    }
-    scales.mass = battery::power_near(scales.f_ref);
-
-    let mut stiffness = f64::INFINITY;
-    for times in [1.0, 10.0] {
-        runner.run(&scales, |layout| vec![layout.scale_break_away(times)])?;
-        let rows = runner.one("scale_break_away")?.rows().map_err(|why| format!("cannot be pushed: {why}"))?;
-        if let Some((force, travel)) = break_away(&rows, scales.v_slip) {
-            (scales.f_b, scales.x_b) = (force, travel.abs());
-            scales.travel = travel_to(&rows, 0.99 * force).map_or(scales.x_b, f64::abs);
-            stiffness = early_stiffness(&rows, force).unwrap_or(f64::INFINITY);
-            break;
+/// Characterises several members of a family on the same benches. `members`: each with the name of its battery. Returns
+/// the studies, and for each member without one the reason, as a message or a report.
+pub fn family(members: Vec<(Subject, String)>, sources: &(dyn Sources + Sync)) -> (Vec<Study>, Vec<String>) {
+    let (mut scaled, mut failures): (Vec<Scaled>, Vec<String>) = (Vec::new(), Vec::new());
+    for (subject, name) in members {
+        let label = subject.instance.label();
+        match Scaled::new(subject, &name, sources) {
+            Ok(member) => scaled.push(member),
+            Err(why) => failures.push(format!("{label} {why}")),
         }
-        runner.entries.retain(|entry| entry.name != "scale_break_away");
     }
-    if scales.f_b <= 0.0 {
-        return Err(format!("does not let go under {} times the force it slides with", 60));
+    let scales: Vec<Scales> = scaled.iter().map(|member| member.scales.clone()).collect();
+    let scales: Vec<&Scales> = scales.iter().collect();
+    let bench = battery::family(&scales).zip(scaled.first()).map(|(bench, first)| {
+        let layout = Layout::new(&first.runner.subject, bench.clone());
+        Scales { v_slip: battery::sliding_speed(&scales, &layout), ..bench }
+    });
+    let mut studies = Vec::new();
+    for member in scaled {
+        let label = member.runner.subject.instance.label();
+        match member.study(bench.as_ref(), Extent::Whole) {
+            Ok(study) => studies.push(study),
+            Err(why) => failures.push(format!("{label} {why}")),
+        }
     }
+    (studies, failures)
+}
 
-    runner.run(&scales, |layout| layout.steady())?;
-    let units = Units::of(rotary);
-    let steady = Steady::of(&runner.results)?;
-    (scales.f_c, scales.v_s) = (steady.f_c, steady.v_s.unwrap_or(scales.v_s / 10.0));
-    // Sliding is ten times the Stribeck speed: 10 mm/s for the textbook's 1 mm/s. A mass that oscillates on a contact
-    // which still holds does not slide: under a ramp of rate r it oscillates with up to 2 r/k.
-    let fastest = Layout::new(&subject, scales.clone()).rates().into_iter().fold(0.0, f64::max);
-    scales.v_slip = battery::round((10.0 * scales.v_s).max(4.0 * fastest / stiffness));
+/// A model whose scales have been measured.
+struct Scaled<'a> {
+    runner: Runner<'a>,
+    scales: Scales,
+    steady: Steady,
+}
 
-    runner.run(&scales, |layout| {
-        let wanted = |entry: &Entry| extent == Extent::Whole || entry.name.starts_with("presliding");
-        layout.rest().into_iter().filter(wanted).collect()
-    })?;
-    let layout = Layout::new(&subject, scales.clone());
-    let text = battery::text(&subject.imports, &layout.head(), &runner.entries);
-    let dissipation = runner.dissipation(&text);
-    let (chatter, slow) = (runner.chatter.clone(), runner.slow);
-    let reader = StudyReader {
-        results: &runner.results,
-        layout: &layout,
-        units,
-        scales: &scales,
-        steady: &steady,
-        chatters: chatter.is_some(),
-        reference: runner.entries.iter().find(|entry| entry.name == "steps_reference").and_then(Entry::step),
-    };
-    let tests = reader.tests(dissipation);
-    // The step-size sweep has fixed steps on purpose.
-    let stepped = runner.entries.iter().filter(|entry| !entry.adaptive() && !entry.name.starts_with("steps_"));
-    let stepped: Vec<String> = stepped.map(|entry| entry.name.clone()).collect();
-    let findings = phenomena::findings(&subject, &scales, &tests, &stepped, chatter.as_deref());
-    let mut notes = Vec::new();
-    if !subject.held.is_empty() {
-        let one = |(name, value): &(String, String)| format!("{name} = {value}");
-        let held: Vec<String> = subject.held.iter().map(one).collect();
-        notes.push(format!(
-            "Beside v, these inputs were held: {}. `--over '{} = …, …'` draws a family over one of them.",
-            held.join(", "),
-            subject.held[0].0
-        ));
-    }
-    if slow {
-        notes.push(
-            "Some adaptive runs took too many steps, and were run with a fixed step: what happens within one is not seen."
-                .to_string(),
-        );
-    }
-    if let Some(chatter) = chatter {
-        let made_to_hold = match subject.states {
-            0 => format!(" `Sticking(law = {})` is the same law made to hold.", subject.instance),
-            _ => String::new(),
+impl<'a> Scaled<'a> {
+    fn new(subject: Subject, name: &str, sources: &'a (dyn Sources + Sync)) -> Result<Scaled<'a>, String> {
+        let rotary = subject.rotary;
+        // Rotary twins of translational models keep their numbers; models written for shafts run faster.
+        let v_max = if rotary && !subject.instance.is_rotary() { 10.0 } else { 1.0 };
+        let mut runner = Runner {
+            subject,
+            name: name.into(),
+            sources,
+            entries: Vec::new(),
+            results: Results::new(),
+            chatter: None,
+            slow: false,
         };
-        notes.push(format!(
-            "At rest it chatters: {chatter} to and fro without end. What comes to rest was therefore run with a fixed \
-             step; there the force jumps to and fro at every step, and what it carries is an average.{made_to_hold}"
-        ));
+        let mut scales = Scales {
+            f_ref: 0.0,
+            mass: 1.0,
+            f_b: 0.0,
+            x_b: 0.0,
+            travel: 0.0,
+            f_c: 0.0,
+            v_s: 0.01 * v_max,
+            stiffness: f64::INFINITY,
+            v_slip: 0.01 * v_max,
+            v_max,
+        };
+
+        runner.run(&scales, None, |layout| vec![layout.scale_sliding()])?;
+        let sliding = runner.one("scale_sliding")?.rows().map_err(|why| format!("does not slide steadily: {why}"))?;
+        scales.f_ref = sliding.last().map_or(0.0, |row| row[1].abs());
+        if scales.f_ref.is_nan() || scales.f_ref <= 0.0 {
+            return Err("gives no force when it slides, so there is nothing to characterise".into());
+        }
+        scales.mass = battery::power_near(scales.f_ref);
+
+        for times in [1.0, 10.0] {
+            runner.run(&scales, None, |layout| vec![layout.scale_break_away(times)])?;
+            let rows = runner.one("scale_break_away")?.rows().map_err(|why| format!("cannot be pushed: {why}"))?;
+            if let Some((force, travel)) = break_away(&rows, scales.v_slip) {
+                (scales.f_b, scales.x_b) = (force, travel.abs());
+                scales.travel = travel_to(&rows, 0.99 * force).map_or(scales.x_b, f64::abs);
+                scales.stiffness = early_stiffness(&rows, force).unwrap_or(f64::INFINITY);
+                break;
+            }
+            runner.entries.retain(|entry| entry.name != "scale_break_away");
+        }
+        if scales.f_b <= 0.0 {
+            return Err(format!("does not let go under {} times the force it slides with", 60));
+        }
+
+        runner.run(&scales, None, |layout| layout.steady())?;
+        let steady = Steady::of(&runner.results)?;
+        (scales.f_c, scales.v_s) = (steady.f_c, steady.v_s.unwrap_or(scales.v_s / 10.0));
+        let layout = Layout::new(&runner.subject, scales.clone());
+        scales.v_slip = battery::sliding_speed(&[&scales], &layout);
+        Ok(Scaled { runner, scales, steady })
     }
-    if subject.external == External::Absent && subject.states == 0 && subject.regimes.is_empty() {
-        notes.push("A static map of the velocity: it has no memory, and no port F_ext to hold a load with.".into());
+
+    /// Runs the battery: on benches of these scales, or of its own.
+    fn study(self, bench: Option<&Scales>, extent: Extent) -> Result<Study, String> {
+        let Scaled { mut runner, mut scales, steady } = self;
+        let units = Units::of(runner.subject.rotary);
+        if let Some(bench) = bench {
+            scales.v_slip = bench.v_slip;
+        }
+        runner.run(&scales, bench, |layout| {
+            let wanted = |entry: &Entry| extent == Extent::Whole || entry.name.starts_with("presliding");
+            layout.rest().into_iter().filter(wanted).collect()
+        })?;
+        let layout = on(Layout::new(&runner.subject, scales.clone()), bench);
+        let text = battery::text(&runner.subject.imports, &layout.head(), &runner.entries);
+        let dissipation = runner.dissipation(&text);
+        let (chatter, slow) = (runner.chatter.clone(), runner.slow);
+        let reader = StudyReader {
+            results: &runner.results,
+            layout: &layout,
+            units,
+            scales: &scales,
+            steady: &steady,
+            chatters: chatter.is_some(),
+            reference: runner.entries.iter().find(|entry| entry.name == "steps_reference").and_then(Entry::step),
+        };
+        let tests = reader.tests(dissipation.as_ref());
+        let subject = &runner.subject;
+        // The step-size sweep has fixed steps on purpose.
+        let stepped = runner.entries.iter().filter(|entry| !entry.adaptive() && !entry.name.starts_with("steps_"));
+        let stepped: Vec<String> = stepped.map(|entry| entry.name.clone()).collect();
+        let findings = phenomena::findings(subject, &scales, &tests, dissipation, &stepped, chatter.as_deref());
+        let mut notes = Vec::new();
+        if !subject.held.is_empty() {
+            let one = |(name, value): &(String, String)| format!("{name} = {value}");
+            let held: Vec<String> = subject.held.iter().map(one).collect();
+            notes.push(format!(
+                "Beside v, these inputs were held: {}. `--over '{} = …, …'` draws a family over one of them.",
+                held.join(", "),
+                subject.held[0].0
+            ));
+        }
+        if slow {
+            notes.push(
+                "Some adaptive runs took too many steps, and were run with a fixed step: what happens within one is not seen."
+                    .to_string(),
+            );
+        }
+        if let Some(chatter) = chatter {
+            let made_to_hold = match subject.states {
+                0 => format!(" `Sticking(law = {})` is the same law made to hold.", subject.instance),
+                _ => String::new(),
+            };
+            notes.push(format!(
+                "At rest it chatters: {chatter} to and fro without end. What comes to rest was therefore run with a fixed \
+                 step; there the force jumps to and fro at every step, and what it carries is an average.{made_to_hold}"
+            ));
+        }
+        if subject.external == External::Absent && subject.states == 0 && subject.regimes.is_empty() {
+            notes.push("A static map of the velocity: it has no memory, and no port F_ext to hold a load with.".into());
+        }
+        let bench = bench.map(|_| {
+            let pulls = layout.pull_speeds();
+            format!(
+                "one bench for all: mass {} {}, spring {} {}, pull speeds {} to {}, force rates {} to {}; laid out for a \
+                 break-away force of {}, the middle of the family in ratio",
+                n(layout.bench().mass),
+                units.mass,
+                n(2.0 * layout.bench().mass),
+                units.stiffness,
+                shown(pulls[0], units.speed),
+                shown(pulls[pulls.len() - 1], units.speed),
+                n(layout.rates()[0]),
+                format_args!("{} {}", n(layout.rates()[layout.rates().len() - 1]), units.rate),
+                shown(layout.bench().f_b, units.force),
+            )
+        });
+        let mass = layout.bench().mass;
+        let label = subject.instance.label();
+        Ok(Study { label, units, battery: text, scales, mass, bench, tests, findings, notes, subject: runner.subject })
     }
-    let label = subject.instance.label();
-    Ok(Study { label, units, battery: text, scales, tests, findings, notes, subject })
+}
+
+/// A layout on the bench that it shares with others, if any.
+fn on<'a>(layout: Layout<'a>, bench: Option<&Scales>) -> Layout<'a> {
+    match bench {
+        Some(bench) => layout.on(bench.clone()),
+        None => layout,
+    }
 }
 
 /// Collects the experiments and their results.
 struct Runner<'a> {
-    subject: &'a Subject,
-    name: &'a str,
+    subject: Subject,
+    name: String,
     sources: &'a (dyn Sources + Sync),
     entries: Vec<Entry>,
     results: Results,
@@ -239,8 +316,13 @@ struct Runner<'a> {
 }
 
 impl Runner<'_> {
-    fn run(&mut self, scales: &Scales, entries: impl Fn(&Layout) -> Vec<Entry>) -> Result<(), String> {
-        let layout = Layout::new(self.subject, scales.clone());
+    fn run(
+        &mut self,
+        scales: &Scales,
+        bench: Option<&Scales>,
+        entries: impl Fn(&Layout) -> Vec<Entry>,
+    ) -> Result<(), String> {
+        let layout = on(Layout::new(&self.subject, scales.clone()), bench);
         let first = self.entries.len();
         self.entries.extend(entries(&layout));
         // An experiment that was slow once will be slow again.
@@ -250,7 +332,7 @@ impl Runner<'_> {
         let mut names: Vec<String> = self.entries[first..].iter().map(|entry| entry.name.clone()).collect();
         for _ in 0..2 {
             let text = battery::text(&self.subject.imports, &layout.head(), &self.entries);
-            let loaded = bench::load(self.name, &text, self.sources)?;
+            let loaded = bench::load(&self.name, &text, self.sources)?;
             let results = bench::run(&loaded, &names, self.sources);
             names = results
                 .iter()
@@ -282,7 +364,7 @@ impl Runner<'_> {
     }
 
     fn dissipation(&self, text: &str) -> Option<Verdict> {
-        let loaded = bench::load(self.name, text, self.sources).ok()?;
+        let loaded = bench::load(&self.name, text, self.sources).ok()?;
         let written = self.subject.instance.to_string();
         let (instance, _) = grammar::parse::parse_instance(loaded.root(), &written);
         compile::dissipation(&loaded, self.sources, &instance?, loaded.root())
@@ -425,7 +507,7 @@ const JUMPS: &str = "at rest its force jumps to and fro";
 type Read = Result<(Vec<Graph>, Vec<Number>), String>;
 
 impl StudyReader<'_> {
-    fn tests(&self, dissipation: Option<Verdict>) -> Vec<Test> {
+    fn tests(&self, dissipation: Option<&Verdict>) -> Vec<Test> {
         let s = self.scales;
         let test = |key, title, how: String, read: Read| {
             let (result, numbers) = match read {
@@ -451,7 +533,7 @@ impl StudyReader<'_> {
                 "Break-away against force rate",
                 format!(
                     "A mass of {} {} pushed by a growing force; the largest friction before the speed first reaches {}.",
-                    n(s.mass),
+                    n(self.layout.bench().mass),
                     self.units.mass,
                     speed(s.v_slip)
                 ),
@@ -461,7 +543,8 @@ impl StudyReader<'_> {
                 "presliding",
                 "Presliding hysteresis",
                 format!(
-                    "A slow force to 30 % and 95 % of the break-away force ({}) and back, with an inner loop.",
+                    "A slow force to 30 % and 95 % of the break-away force ({}) and back; the second loop is measured, then \
+                     an inner one.",
                     force(s.f_b)
                 ),
                 self.read_presliding(),
@@ -469,7 +552,10 @@ impl StudyReader<'_> {
             test(
                 "lag",
                 "Frictional lag",
-                format!("Speed {} · (1.5 + sin ωt), which keeps its sign; the last cycle of each.", speed(s.v_s)),
+                format!(
+                    "Speed {} · (1.5 + sin ωt), which keeps its sign; the last cycle of each.",
+                    speed(self.layout.bench().v_s)
+                ),
                 self.read_lag(),
             ),
             test(
@@ -483,9 +569,9 @@ impl StudyReader<'_> {
                 "Stick-slip on a spring",
                 format!(
                     "A mass of {} {} pulled through a spring of {} {} without damping.",
-                    n(s.mass),
+                    n(self.layout.bench().mass),
                     self.units.mass,
-                    n(2.0 * s.mass),
+                    n(2.0 * self.layout.bench().mass),
                     self.units.stiffness
                 ),
                 self.read_stick_slip(),
@@ -508,7 +594,9 @@ impl StudyReader<'_> {
             test(
                 "energy",
                 "Energy per cycle",
-                "Sinusoidal cycles of growing amplitude at one greatest speed; the loss of the last of three.".into(),
+                "Sinusoidal cycles of growing amplitude at one greatest speed; the loss of a cycle after the contact has \
+                 forgotten its start."
+                    .into(),
                 self.read_energy(),
             ),
             test(
@@ -673,29 +761,26 @@ impl StudyReader<'_> {
             logarithmic: (false, false),
             lines: vec![Line::course("to 95 %", course(&large)), Line::course("to 30 %", course(&small)).aside()],
         };
-        let small_travel = peak_to_peak(&small, 2);
-        let large_travel = peak_to_peak(&large, 2);
-        // u: 0, a, −a, a/2, 0, a. The times of the stops follow from the constant rate.
-        let a = large.iter().map(|row| row[1]).fold(0.0, f64::max);
-        let end = large.last().map_or(0.0, |row| row[0]);
-        // On the total path of 6 a: first at a/2 on the way up after 4.5 a, back there after 5.5 a.
-        let at = |part: f64| value_at(&large, end * part / 6.0, 2);
-        let (left, turned, back) = (at(4.5), at(5.0), at(5.5));
+        let small_travel = peak_to_peak(&between(&small, self.layout.presliding(0.3).loop_times()), 2);
+        let path = self.layout.presliding(0.95);
+        let large_loop = ClosedLoop::of(&large, path.loop_times(), one(self.results, "presliding_large")?.reading(0));
+        let [left, turned, back] = path.inner_times().map(|t| value_at(&large, t, 2));
         let inner = (left - turned).abs();
-        let loop_area = area(&large, end * 1.0 / 6.0, end * 5.0 / 6.0);
         let mut numbers = vec![
             self.number("presliding_travel", "travel within ±30 %", small_travel, self.units.length),
-            self.number("presliding_travel_large", "travel within ±95 %", large_travel, self.units.length),
+            self.number("presliding_travel_large", "travel within ±95 %", large_loop.travel, self.units.length),
         ];
         if let Some(stiffness) = early_stiffness(&small, self.scales.f_b)
             && small_travel > 0.0
         {
             numbers.push(self.number("stiffness", "stiffness at 10 %", stiffness, self.units.stiffness));
         }
+        numbers.push(self.number("loop_loss", "loss of a large loop", large_loop.area, "J"));
+        numbers.push(self.number("loop_area", "area of the large loop over its box", large_loop.part(), ""));
         numbers.push(self.number(
-            "loop_area",
-            "area of the large loop over its box",
-            loop_area / (2.0 * a * large_travel).max(1e-300),
+            "loop_gap",
+            "the large loop moves on by, of its travel",
+            large_loop.gap.abs() / large_loop.travel.max(1e-300),
             "",
         ));
         if inner > 0.0 {
@@ -716,9 +801,8 @@ impl StudyReader<'_> {
         for (i, f) in self.layout.lag_frequencies().into_iter().enumerate() {
             let rows = self.rows(&format!("lag_{}", i + 1))?;
             let end = rows.last().map_or(0.0, |row| row[0]);
-            // From the previous row on, so that the loop closes.
-            let first = rows.partition_point(|row| row[0] < end - 1.0 / f).saturating_sub(1);
-            let last: Vec<(f64, f64)> = rows[first..].iter().map(|row| (row[2], row[1])).collect();
+            let last = between(&rows, (end - 1.0 / f, end));
+            let last: Vec<(f64, f64)> = last.iter().map(|row| (row[2], row[1])).collect();
             let width = lag(&last);
             widths.push((f, width.abs()));
             numbers.push(self.number(
@@ -849,6 +933,8 @@ impl StudyReader<'_> {
                 lines: vec![Line::marked("", periods)],
             });
         }
+        numbers.push(self.number("slowest_pull", "slowest pull", speeds[0], self.units.speed));
+        numbers.push(self.number("fastest_pull", "fastest pull", speeds[speeds.len() - 1], self.units.speed));
         if let Some(vp) = sticks_last {
             numbers.push(self.number("stick_slip_up_to", "sticks and slips up to", vp, self.units.speed));
         }
@@ -936,8 +1022,9 @@ impl StudyReader<'_> {
             let rows = self.rows(&name)?;
             points.push((x, loss.unwrap_or(f64::NAN)));
             if i == 5 {
-                let from = rows.last().map_or(0.0, |row| row[0]) * 2.0 / 3.0;
-                let cycle = rows.iter().filter(|row| row[0] >= from).map(|row| (row[2] - x, row[1])).collect();
+                let end = rows.last().map_or(0.0, |row| row[0]);
+                let from = end * (1.0 - 1.0 / self.layout.cycles(x));
+                let cycle = between(&rows, (from, end)).iter().map(|row| (row[2] - x, row[1])).collect();
                 lines.push(Line::course("", cycle));
             }
         }
@@ -1018,7 +1105,7 @@ impl StudyReader<'_> {
         Ok((vec![graph], numbers))
     }
 
-    fn read_dissipation(&self, verdict: Option<Verdict>) -> Read {
+    fn read_dissipation(&self, verdict: Option<&Verdict>) -> Read {
         let (mut least, mut greatest, mut lines) = (f64::INFINITY, 0.0_f64, Vec::new());
         for i in 1..=6 {
             let name = format!("closed_path_{i}");
@@ -1027,8 +1114,9 @@ impl StudyReader<'_> {
             greatest = greatest.max(work);
             if work < least {
                 least = work;
-                let second = rows.iter().filter(|row| row[0] >= 1.0);
-                let power = second.map(|row| (row[0] - 1.0, row[1] * row[2])).collect();
+                let end = rows.last().map_or(1.0, |row| row[0]);
+                let last = between(&rows, (end - 1.0, end));
+                let power = last.iter().map(|row| (row[0] - (end - 1.0), row[1] * row[2])).collect();
                 lines = vec![Line::course("power into the contact, least of six", power)];
             }
         }
@@ -1051,7 +1139,7 @@ impl StudyReader<'_> {
                 numbers.push(self.number(
                     "dissipation_points",
                     "points searched, none gives out power",
-                    points as f64,
+                    *points as f64,
                     "",
                 ));
             }
@@ -1059,7 +1147,7 @@ impl StudyReader<'_> {
                 numbers.push(self.number("pushes_at", "gives out power at v =", point.v, self.units.speed));
                 numbers.push(self.number("pushes_with", "there F =", point.force, self.units.force));
             }
-            Some(Verdict::NotChecked) | None => {}
+            Some(Verdict::NotChecked(_)) | None => {}
         }
         Ok((vec![graph], numbers))
     }
@@ -1114,10 +1202,43 @@ fn value_at(rows: &[Vec<f64>], t: f64, column: usize) -> f64 {
     }
 }
 
-/// ∮ F dx between two times. Rows hold t, F, x.
-fn area(rows: &[Vec<f64>], from: f64, to: f64) -> f64 {
-    let inside: Vec<&Vec<f64>> = rows.iter().filter(|row| row[0] >= from && row[0] <= to).collect();
-    inside.windows(2).map(|pair| 0.5 * (pair[0][1] + pair[1][1]) * (pair[1][2] - pair[0][2])).sum::<f64>().abs()
+/// The rows between two times, with both ends, interpolated linearly where there is no row.
+fn between(rows: &[Vec<f64>], (from, to): (f64, f64)) -> Vec<Vec<f64>> {
+    let width = rows.first().map_or(0, Vec::len);
+    let at = |t: f64| (0..width).map(|column| if column == 0 { t } else { value_at(rows, t, column) }).collect();
+    let inside = rows.iter().filter(|row| row[0] > from && row[0] < to).cloned();
+    std::iter::once(at(from)).chain(inside).chain(std::iter::once(at(to))).collect()
+}
+
+/// A loop of the force over the travel, from a turn of the force to the next of the same side.
+struct ClosedLoop {
+    /// Loss of the loop: its area, J.
+    area: f64,
+    /// Greatest travel within it.
+    travel: f64,
+    /// Greatest force minus least force within it.
+    height: f64,
+    /// How far it moves on: 0 if it closes.
+    gap: f64,
+}
+
+impl ClosedLoop {
+    /// Rows hold t, F, x; `work`: ∫F v dt between these times, as the run integrated it. A loop that moves on is closed
+    /// by the chord between its ends, whose work is not a loss of the loop.
+    fn of(rows: &[Vec<f64>], times: (f64, f64), work: Option<f64>) -> ClosedLoop {
+        let inside = between(rows, times);
+        let (Some(first), Some(last)) = (inside.first(), inside.last()) else {
+            return ClosedLoop { area: f64::NAN, travel: 0.0, height: 0.0, gap: 0.0 };
+        };
+        let gap = last[2] - first[2];
+        let area = work.unwrap_or(f64::NAN) - 0.5 * (first[1] + last[1]) * gap;
+        ClosedLoop { area, travel: peak_to_peak(&inside, 2), height: peak_to_peak(&inside, 1), gap }
+    }
+
+    /// Its area over that of the box around it.
+    fn part(&self) -> f64 {
+        self.area / (self.height * self.travel).max(1e-300)
+    }
 }
 
 /// Force at increasing speed minus force at the same decreasing speed, where that difference is largest.

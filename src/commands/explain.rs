@@ -2,7 +2,7 @@
 
 use super::End;
 use crate::args::Explain;
-use crate::compile::{self, Changes, Explanation, Method, Stopwatch, Verdict};
+use crate::compile::{self, Changes, Explanation, Method, Stopwatch};
 use crate::quantity::duration;
 use crate::report;
 use crate::terminal::{Style, Terminal};
@@ -183,7 +183,7 @@ pub(super) fn tell(explanation: &Explanation, bounds: &[Bound], terminal: &mut T
         });
     }
     if let Some(verdict) = &explanation.dissipation {
-        terminal.line(&format!("  dissipation: {}", dissipation(verdict)));
+        terminal.line(&format!("  dissipation: {}", verdict.words()));
     }
     terminal.line("");
 }
@@ -194,19 +194,6 @@ fn stable_steps(explanation: &Explanation) -> Option<String> {
         |step: &compile::StepCost| Some(format!("{} {}", step.method.name(), compile::stable_up_to(step.stable?)));
     let all: Option<Vec<String>> = explanation.steps.iter().map(one).collect();
     all.map(|all| all.join(", "))
-}
-
-fn dissipation(verdict: &Verdict) -> String {
-    match verdict {
-        Verdict::Proved => "proved".into(),
-        Verdict::Holds(points) => format!("holds at {points} samples"),
-        Verdict::Fails(point) => {
-            format!("fails: at v = {:.3e} m/s it gives F = {:.3e} N and drives the motion", point.v, point.force)
-        }
-        Verdict::NotChecked => {
-            "not checked: a model with states or regimes needs a `storage` and ranges of its states".into()
-        }
-    }
 }
 
 fn as_json(explanation: &Explanation, bounds: &[Bound]) -> serde_json::Value {
@@ -232,7 +219,7 @@ fn as_json(explanation: &Explanation, bounds: &[Bound]) -> serde_json::Value {
         })).collect::<Vec<_>>(),
         "storage": explanation.storage,
         "rate_independent": explanation.rate_independent,
-        "dissipation": explanation.dissipation.as_ref().map(dissipation),
+        "dissipation": explanation.dissipation.as_ref().map(compile::Verdict::words),
     })
 }
 

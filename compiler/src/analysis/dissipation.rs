@@ -32,8 +32,25 @@ pub enum Verdict {
     Holds(usize),
     /// The model supplies power at this point.
     Fails(Counterexample),
-    /// Not checked: a model with states needs a `storage` function; sampled blocks and delays are not supported.
-    NotChecked,
+    /// Not checked, with the reason: a model with states needs a `storage` function; sampled blocks and delays are not
+    /// supported.
+    NotChecked(String),
+}
+
+impl Verdict {
+    /// The verdict in words: what `fric explain` and the table of phenomena say. A verdict without proof says so first.
+    pub fn words(&self) -> String {
+        match self {
+            Verdict::Proved => "proved".into(),
+            Verdict::Holds(points) => format!("not proven: no counterexample at {points} points"),
+            Verdict::Fails(point) => format!(
+                "fails: at v = {} m/s it gives F = {} N and drives the motion",
+                three_digits(point.v),
+                three_digits(point.force)
+            ),
+            Verdict::NotChecked(why) => format!("not proven: {why}"),
+        }
+    }
 }
 
 /// A point at which a model supplies power.
@@ -376,8 +393,15 @@ fn sampled(system: &System, contact: &ContactPorts, bench: &mut PointEvaluator) 
     let storage = system.storages.iter().find(|(owner, _)| *owner == InstanceId(0)).map(|(_, energy)| *energy);
     // A state on which the force does not depend stores no energy.
     let memory = bench.matters.contains(&true);
-    if memory && storage.is_none() || !system.blocks.is_empty() || !system.delays.is_empty() {
-        return Verdict::NotChecked;
+    let not_checked = |why: &str| Verdict::NotChecked(why.into());
+    if !system.blocks.is_empty() {
+        return not_checked("the analysis knows no sampled code");
+    }
+    if !system.delays.is_empty() {
+        return not_checked("the analysis knows no `delay`");
+    }
+    if memory && storage.is_none() {
+        return not_checked("a model with states needs a `storage`, the energy that they store");
     }
     let flow = bench.flow.clone();
     // Values of each state: the ends of its range, 0 and half-way points. A state without a range keeps its start
@@ -385,17 +409,23 @@ fn sampled(system: &System, contact: &ContactPorts, bench: &mut PointEvaluator) 
     let mut choices: Vec<Vec<f64>> = Vec::new();
     for k in 0..n {
         let slot = layout.states.slot(k);
-        let range = bench.program.description.quantities.iter().find(|q| q.slot == slot).map(|q| q.range);
-        choices.push(match range {
+        let state = bench.program.description.quantities.iter().find(|q| q.slot == slot);
+        choices.push(match state.map(|q| q.range) {
             Some((low, high)) if low.is_finite() && high.is_finite() => {
                 vec![low, high, 0.0_f64.clamp(low, high), 0.5 * low, 0.5 * high]
             }
             _ if !bench.matters[k] => Vec::new(),
-            _ => return Verdict::NotChecked,
+            _ => {
+                let name = state.map_or("a state".into(), |state| format!("the state `{}`", state.path));
+                return Verdict::NotChecked(format!("{name} needs a range with two ends, `in a .. b`"));
+            }
         });
     }
-    if choices.iter().filter(|choice| !choice.is_empty()).count() > 4 || system.automata.len() > 1 {
-        return Verdict::NotChecked;
+    if choices.iter().filter(|choice| !choice.is_empty()).count() > 4 {
+        return not_checked("the analysis knows up to four states");
+    }
+    if system.automata.len() > 1 {
+        return not_checked("the analysis knows one automaton");
     }
     let corners: usize = choices.iter().map(|choice| choice.len().max(1)).product();
     let regime = layout.regimes.range().next();
