@@ -6,7 +6,7 @@
 
 pub mod lag;
 pub mod predictor;
-pub(crate) mod sil;
+pub mod sil;
 pub mod eigenvalues;
 pub mod passivity;
 pub mod loop_stability;

@@ -11,7 +11,7 @@ use crate::run::observe::{Observer, check_finite, check_status};
 use crate::run::outcome::{Cause, Continue, Stop, Work};
 use abi::plan::Experiment;
 use abi::rig::{Bench, Field, Format, Kind, Rig, Signal, SignalKind};
-use abi::{Instance, Slot};
+use abi::{Function, Instance, Slot};
 
 /// Path of a command from the control program to the plant.
 struct Path {
@@ -66,19 +66,7 @@ pub(crate) fn run(
     let mut paths = paths(rig);
     let readings = readings(rig, &paths);
     let unable = |why| Stop { cause: Cause::Rig { condition: "predict".into(), why }, time: 0.0 };
-    let mut look = SilPredictor {
-        wired: Wired::of(rig, &bench.plant, |_| 0).map_err(unable)?,
-        seen: None,
-        speed: None,
-        position: None,
-    };
-    if let Some(wired) = &look.wired {
-        let slot = |what| rig.plant.seen.iter().find(|(signal, _)| *signal == Signal { node: wired.node, what });
-        look.seen = slot(SignalKind::Position).map(|(signal, slot)| (*slot, step_of_signal(rig, *signal)));
-        let input = |what| rig.inputs.iter().find(|input| input.signal == Signal { node: wired.node, what });
-        look.speed = input(SignalKind::Speed).map(|input| input.slot);
-        look.position = input(SignalKind::Position).map(|input| input.slot);
-    }
+    let mut look = SilPredictor::of(rig, &bench.plant).map_err(unable)?;
 
     let status = plant.start(period / steps as f64);
     check_status(&plant, status)?;
@@ -103,23 +91,10 @@ pub(crate) fn run(
             let cause = Cause::Rig { condition: stop.condition.clone(), why: stop.why.clone() };
             return Err(Stop { cause, time: control.get(Slot::TIME) });
         }
-        for path in &mut paths {
-            let wanted = control.get(path.from).clamp(path.low, path.high);
-            path.permitted += (wanted - path.permitted).clamp(-path.change, path.change);
-            path.lag.send(now + path.dead_ns, in_steps(path.permitted, path.step));
-        }
+        command(now, &mut paths, control);
         look.sent(&paths);
-        for k in 0..steps {
-            let (from, to) = (now + k * period_ns / steps, now + (k + 1) * period_ns / steps);
-            for path in &mut paths {
-                let mean = path.lag.advance(from, to);
-                if let Some(slot) = path.to {
-                    plant.set(slot, mean);
-                }
-            }
-            let status = plant.advance(1);
-            check_status(&plant, status)?;
-        }
+        let status = move_on(now, period_ns, steps, &mut plant, &mut paths);
+        check_status(&plant, status)?;
         check_finite(&plant)?;
         work.steps += u64::from(rig.steps);
         if tick % 256 == 0 && watch(tick as f64 / ticks as f64).is_break() {
@@ -127,6 +102,111 @@ pub(crate) fn run(
         }
     }
     Ok(())
+}
+
+/// Sends what the control program requests, as far as it is permitted.
+fn command(now_ns: u64, paths: &mut [Path], control: &Instance) {
+    for path in paths {
+        let wanted = control.get(path.from).clamp(path.low, path.high);
+        path.permitted += (wanted - path.permitted).clamp(-path.change, path.change);
+        path.lag.send(now_ns + path.dead_ns, in_steps(path.permitted, path.step));
+    }
+}
+
+/// Moves the plant on by one period; returns its status.
+fn move_on(now_ns: u64, period_ns: u64, steps: u64, plant: &mut Instance, paths: &mut [Path]) -> u64 {
+    for k in 0..steps {
+        let (from, to) = (now_ns + k * period_ns / steps, now_ns + (k + 1) * period_ns / steps);
+        for path in &mut *paths {
+            let mean = path.lag.advance(from, to);
+            if let Some(slot) = path.to {
+                plant.set(slot, mean);
+            }
+        }
+        let status = plant.advance(1);
+        if status != 0 {
+            return status;
+        }
+    }
+    0
+}
+
+/// The moment of a run on a rig from which [`ahead`] goes on.
+pub struct Moment<'a> {
+    /// The block of the control program after a cycle.
+    pub control: &'a [f64],
+    /// What the drives measured at the begin of that cycle: values of signals that the plant shows, SI. The others are as
+    /// at its start.
+    pub measured: &'a [(Signal, f64)],
+    /// The outputs that were permitted in that cycle, SI.
+    pub permitted: &'a [f64],
+}
+
+/// Runs a rig's programs on, without hardware, from a moment of a run on the rig. `steps`: of the plant in a period.
+/// `each` receives the control program after each of the following `ticks`; it is called fewer times if a program cannot
+/// continue, or the plant cannot be set to what was measured.
+pub fn ahead(
+    rig: &Rig,
+    (control, plant): (&Instance, &Instance),
+    from: &Moment,
+    (steps, ticks): (u64, u64),
+    each: &mut dyn FnMut(&Instance),
+) {
+    let period = rig.period_ns as f64 * 1e-9;
+    let (mut control, mut plant) = (control.clone(), plant.clone());
+    let Ok(mut look) = SilPredictor::of(rig, &plant) else { return };
+    let mut paths = paths(rig);
+    let readings = readings(rig, &paths);
+    // What is computed at a start, and is in no block, is there afterwards.
+    let started = plant.start(period / steps as f64) == 0 && control.start(period / f64::from(rig.steps)) == 0;
+    if !started || control.block().len() != from.control.len() || paths.len() != from.permitted.len() {
+        return;
+    }
+    control.block_mut().copy_from_slice(from.control);
+    let behind = behind(&plant, rig);
+    for (signal, value) in from.measured {
+        match behind.iter().find(|(known, _)| known == signal) {
+            Some((_, Some(state))) => plant.set(*state, *value),
+            Some((_, None)) => return,
+            None => {}
+        }
+    }
+    for (path, permitted) in paths.iter_mut().zip(from.permitted) {
+        path.permitted = *permitted;
+        path.lag.settle(in_steps(*permitted, path.step));
+    }
+    let mut status = move_on(0, rig.period_ns, steps, &mut plant, &mut paths);
+    for tick in 1..=ticks {
+        let now_ns = tick * rig.period_ns;
+        read(&mut control, &plant, &readings, &paths);
+        look.read(now_ns, &mut control, &plant);
+        status |= control.advance(u64::from(rig.steps));
+        if status != 0 || !control.block()[control.description().layout.states.range()].iter().all(|x| x.is_finite()) {
+            return;
+        }
+        command(now_ns, &mut paths, &control);
+        look.sent(&paths);
+        each(&control);
+        status |= move_on(now_ns, rig.period_ns, steps, &mut plant, &mut paths);
+    }
+}
+
+/// The state of the plant that each of its signals shows; none if it shows something else.
+fn behind(plant: &Instance, rig: &Rig) -> Vec<(Signal, Option<Slot>)> {
+    let mut probe = plant.clone();
+    let states = probe.description().layout.states;
+    for (i, slot) in states.range().enumerate() {
+        probe.block_mut()[slot] = 0.37 + 0.011 * i as f64;
+    }
+    let asked = probe.has(Function::Outputs) && probe.call(Function::Outputs) == 0;
+    let one = |slot: Slot| {
+        let shows = |state: &usize| asked && probe.block()[*state].to_bits() == probe.get(slot).to_bits();
+        match states.contains(slot) {
+            true => Some(slot),
+            false => states.range().find(shows).map(|state| Slot(state as u32)),
+        }
+    };
+    rig.plant.seen.iter().map(|(signal, slot)| (*signal, one(*slot))).collect()
 }
 
 /// The predictor, if the rig has `predict`.
@@ -140,6 +220,18 @@ struct SilPredictor {
 }
 
 impl SilPredictor {
+    fn of(rig: &Rig, plant: &Instance) -> Result<SilPredictor, String> {
+        let mut look = SilPredictor { wired: Wired::of(rig, plant, |_| 0)?, seen: None, speed: None, position: None };
+        if let Some(wired) = &look.wired {
+            let slot = |what| rig.plant.seen.iter().find(|(signal, _)| *signal == Signal { node: wired.node, what });
+            look.seen = slot(SignalKind::Position).map(|(signal, slot)| (*slot, step_of_signal(rig, *signal)));
+            let input = |what| rig.inputs.iter().find(|input| input.signal == Signal { node: wired.node, what });
+            look.speed = input(SignalKind::Speed).map(|input| input.slot);
+            look.position = input(SignalKind::Position).map(|input| input.slot);
+        }
+        Ok(look)
+    }
+
     fn read(&mut self, now_ns: u64, control: &mut Instance, plant: &Instance) {
         let (Some(wired), Some((slot, count))) = (&mut self.wired, self.seen) else { return };
         wired.observer.observe(now_ns, (plant.get(slot) / count).floor() * count);
