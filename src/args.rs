@@ -702,6 +702,12 @@ pub struct Hil {
     /// Print the panel's link, and open no browser
     #[arg(long, requires = "panel")]
     pub no_open: bool,
+    /// Others may look at the panel at this address of this computer, and stop the rig: they have a link of their own
+    #[arg(long, value_name = "ADDR:PORT", requires = "panel")]
+    pub share: Option<std::net::SocketAddr>,
+    /// Stop the rig if no page of the panel has been drawn for this time, such as 2s; it is armed only once one is
+    #[arg(long, value_name = "TIME", requires = "panel", value_parser = dead_man)]
+    pub dead_man: Option<f64>,
     /// Seed of all random numbers of a simulation
     #[arg(long, value_name = "NUMBER", default_value_t = 1)]
     pub seed: u64,
@@ -1031,6 +1037,9 @@ pub struct Panel {
     /// Print the link, and open no browser
     #[arg(long)]
     pub no_open: bool,
+    /// Others may look at this address of this computer, and stop a rig: they have a link of their own
+    #[arg(long, value_name = "ADDR:PORT", conflicts_with = "save")]
+    pub share: Option<std::net::SocketAddr>,
     /// With USER@HOST: option for ssh, such as Port=2222
     #[arg(short = 'o', value_name = "NAME=VALUE")]
     pub options: Vec<String>,
@@ -1211,6 +1220,12 @@ fn positive_time(text: &str) -> Result<f64, String> {
         dimension => return Err(format!("a time is needed, not {}", dimension.describe())),
     }
     if value > 0.0 && value.is_finite() { Ok(value) } else { Err("a time greater than 0 is needed".into()) }
+}
+
+/// The time of a dead man's switch. Logs are written ten times a second, so a picture may be some tenths of a second old.
+fn dead_man(text: &str) -> Result<f64, String> {
+    let time = positive_time(text)?;
+    if time >= 0.5 { Ok(time) } else { Err("0.5 s or more is needed: pictures come ten times a second at best".into()) }
 }
 
 fn address(text: &str) -> Result<Address, String> {

@@ -202,6 +202,11 @@ export class Knobs {
     this.discard();
   }
 
+  /** Prepares the values that differ from these. @param {string[]} texts @param {string[]} now */
+  prepare(texts, now) {
+    texts.forEach((text, i) => { if (text !== now[i]) this.rows[i]?.send(text); });
+  }
+
   /** Forgets what was prepared. */
   discard() {
     this.staged.clear();

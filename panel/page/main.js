@@ -8,8 +8,8 @@ import { Knobs } from './knobs.js';
 const LAST = 20;
 /** How far the picture is behind the newest data, s: these come ten times a second, and the picture moves evenly. */
 const BEHIND = 0.25;
-/** Time between two pictures of what moves, ms. */
-const EACH = 33;
+/** Least time between two pictures of what moves, ms: the browser then takes the next of its own. */
+const EACH = 12;
 
 const element = (/** @type {string} */ id) => /** @type {HTMLElement} */ (document.getElementById(id));
 const input = (/** @type {string} */ id) => /** @type {HTMLInputElement} */ (document.getElementById(id));
@@ -25,6 +25,8 @@ let before = LAST;
 let end = 0;
 /** The right edge of the moving picture, s, at an instant, ms. */
 let edge = 0, edgeAt = 0, connected = false;
+/** When newer data came last, ms. */
+let endAt = 0;
 /** @type {{ plot: Plot, canvas: any, curves: Map<number, any> }[]} */
 let plots = [];
 let /** @type {Knobs | null} */ knobs = null;
@@ -44,20 +46,34 @@ let fresh = 0;
 /** A rule that moves the window. @type {{ curve: number, way: string, level: number, mode: string, place: number, after: number, asked: number, at: number | null, since: number } | null} */
 let trigger = null;
 let questions = 0;
+/** Whether the model beside a rig runs on from arming, and not anew from each full state. */
+let free = false;
+/** Whether a layer of a rig is drawn. @param {number} layer */
+const drawn = layer => hello.kind === 'what if' || layer === 0 || layer === (free || !state.layers[2] ? 1 : 2);
 /** What to do with refusals, by the number of the line. @type {Map<number, (why: string) => void>} */
 const refusals = new Map();
 
 const saved = document.getElementById('data');
 const link = saved ? embedded(JSON.parse(saved.textContent ?? '{}'), message) : connect(buffer => { frames.push(buffer); wake(); }, message, lost);
 
+/** The number of this page; whether it came through the link for others. */
+let me = 0, guest = false;
+/** Whether the commands of this page count: nobody else operates the rig. */
+const operates = () => !guest && (!state?.chair?.holder || state.chair.holder === me);
+
 /** @param {any} what */
 function message(what) {
-  if (what.kind === 'hello') begin(what.is);
+  if (what.kind === 'hello') {
+    if (me !== what.page) answered = 0;
+    [me, guest] = [what.page, what.guest];
+    begin(what.is);
+  }
   if (what.kind === 'state') { state = what.is; show(); }
   if (what.kind === 'measures') {
     what.curves.forEach((/** @type {number} */ curve, /** @type {number} */ i) => measured.set(curve, what.measures[i]));
     wake();
   }
+  if (what.kind === 'csv') written(what);
   if (what.kind === 'found' && what.number === trigger?.asked) found(what.t);
   if (what.kind === 'answer') {
     const refuse = refusals.get(what.number);
@@ -127,15 +143,60 @@ function next() {
   }
   sureUntil = 0;
   if (step === 'enable' || step === 'arm') command(step, problem);
+  if (step === 'again') say('again', problem);
   steps();
 }
 
 function steps() {
-  const step = /** @type {'enable' | 'arm' | '-'} */ (state?.next ?? '-'), place = element('next'), sure = performance.now() < sureUntil;
-  place.hidden = hello?.kind !== 'rig' || step === '-' || !!saved;
+  const step = /** @type {'enable' | 'arm' | 'again' | '-'} */ (state?.next ?? '-'), place = element('next'), sure = performance.now() < sureUntil;
+  place.hidden = hello?.kind !== 'rig' || step === '-' || !!saved || guest;
+  /** @type {HTMLButtonElement} */ (place).disabled = !operates();
   if (step === '-') return;
   place.textContent = (sure ? words.sure : words.next)[step];
   place.classList.toggle('sure', sure);
+}
+
+/** Who operates, and what this page can do about it. */
+function chair() {
+  const place = element('chair'), { holder = null, asks = null, refused = null } = state?.chair ?? {};
+  const mine = holder === me, [text, ...acts] = guest ? [words.guest]
+    : holder === null ? ['']
+      : mine ? asks ? [words.asksYou(asks), 'refuse', 'give'] : [words.youOperate(me)]
+        : asks === me ? [words.asked(holder)]
+          : [refused === me ? words.refusedYou(holder) : words.operates(holder), 'take'];
+  place.hidden = text === '' || hello?.kind !== 'rig' || !!saved;
+  place.classList.toggle('asked', mine && !!asks && !guest);
+  const shown = `${text} ${acts}`;
+  if (place.dataset.shown === shown) return;
+  place.dataset.shown = shown;
+  place.replaceChildren(text, ...acts.map(act => button(words[/** @type {'take' | 'refuse' | 'give'} */ (act)], () => say(act, problem))));
+}
+
+/** Values of the parameters of a rig that were kept under a letter. @type {Map<string, string[]>} */
+const keptOf = new Map();
+
+/** Two sets of values of a rig, to go back and forth: they are prepared, and sent by Apply. */
+function keeps() {
+  const text = state.set || words.none, place = element('kept');
+  if (input('set').value !== text) input('set').value = text;
+  /** @type {HTMLButtonElement} */ (element('copied')).disabled = !state.set;
+  if (place.childElementCount === 2 + keptOf.size) return;
+  place.replaceChildren(...['A', 'B'].flatMap(letter => [
+    button(words.keep(letter), () => { keptOf.set(letter, [...state.texts]); keeps(); }),
+    ...keptOf.has(letter) ? [button(words.goStaged(letter), () => knobs?.prepare(keptOf.get(letter) ?? [], state.texts))] : [],
+  ]));
+}
+
+/** The answers of the rig to this page. */
+function answers() {
+  for (const answer of state.answers ?? []) {
+    if (answer.page !== me || answer.number <= answered) continue;
+    answered = answer.number;
+    const place = element('taken');
+    if (answer.refused) problem(words.answered(answer));
+    place.hidden = !!answer.refused || answer.cycle === null;
+    if (!place.hidden) place.textContent = words.taken(answer);
+  }
 }
 
 /** A line that may be refused. @param {string} line @param {(why: string) => void} refused */
@@ -180,15 +241,20 @@ function begin(/** @type {any} */ is) {
   unit.hidden = hello.knobs.length === 0 || !!saved;
   const rig = hello.kind === 'rig';
   knobs = unit.hidden ? null : new Knobs(element('rows'), hello.knobs, rig ? command : say, rig);
-  for (const id of ['undo', 'text', 'kept', 'copy']) element(id).hidden = rig;
-  element('stages').hidden = !rig;
-  element('marks').hidden = !rig || !!saved;
+  for (const id of ['undo', 'text']) element(id).hidden = rig;
+  keptOf.clear();
+  element('kept').replaceChildren();
+  element('taken').hidden = true;
+  element('kept').hidden = guest;
+  element('stages').hidden = !rig || guest;
+  element('marks').hidden = !rig || !!saved || guest;
   element('stop').hidden = !rig || !!saved;
   if (knobs) knobs.onstaged = () => {
     const n = knobs?.staged.size ?? 0;
     element('apply').textContent = words.apply(n);
-    for (const id of ['apply', 'discard']) /** @type {HTMLButtonElement} */ (element(id)).disabled = n === 0;
+    for (const id of ['apply', 'discard']) /** @type {HTMLButtonElement} */ (element(id)).disabled = n === 0 || id === 'apply' && !operates();
   };
+  if (guest) for (const one of element('rows').querySelectorAll('input')) one.disabled = true;
   knobs?.onstaged();
   if (knobs) {
     knobs.onundo = () => { /** @type {HTMLButtonElement} */ (element('undo')).disabled = knobs?.before.length === 0; };
@@ -284,12 +350,23 @@ function span() {
 /** Asks for the curves of all canvases, once they have their size. */
 function ask() {
   plots.forEach((one, id) => {
-    const { signals, against } = one.canvas, at = newest ? `last ${newest}` : window_ ? `${window_[0]} ${window_[1]}` : 'all';
+    const { signals, against } = one.canvas, at = newest ? `last ${lasts()}` : window_ ? `${window_[0]} ${window_[1]}` : 'all';
     if (against === null) link.send(`view ${id} ${signals.join(',')} ${at} ${one.plot.columns()}`);
     else link.send(`path ${id} ${against},${signals[0]} ${at}`);
   });
+  askedFor = newest ? lasts() : 0;
   asked = true;
 }
+
+/** Seconds of the newest for which is asked: while there is less, columns are finer. */
+function lasts() {
+  const there = end - all()[0];
+  let seconds = newest ?? 0;
+  while (seconds / 2 > Math.max(there, 1)) seconds /= 2;
+  return seconds;
+}
+/** For how many was asked. */
+let askedFor = 0;
 
 /** @param {[number, number] | null} to */
 function move(to) {
@@ -441,10 +518,10 @@ function show() {
     sentence(bad ? 'bad' : rig && state.stage !== 'armed' ? 'old' : 'good', rig ? words.rig(state) : words.recording(state));
     if (rig) {
       steps();
-      if (state.answer && state.answer.number !== answered) {
-        answered = state.answer.number;
-        if (state.answer.refused) problem(words.answered(state.answer));
-      }
+      chair();
+      answers();
+      knobs?.onstaged();
+      /** @type {HTMLButtonElement} */ (element('mark')).disabled = !operates();
     }
     events();
     if (newest && hello.grows && state.grows === false) move(span());
@@ -454,6 +531,7 @@ function show() {
     sentence(failed ? 'bad' : 'good', failures.length ? words.failed(failures) : words.running(hello, state.run));
   }
   knobs?.follow(state.values);
+  if (knobs && hello.kind === 'rig') keeps();
   if (knobs && hello.kind === 'what if') {
     knobs.live = state.short;
     input('set').value = state.set || words.none;
@@ -484,12 +562,13 @@ function show() {
 function legend() {
   const place = element('legend');
   if (hello.kind !== 'what if') {
-    const there = state.layers[1];
-    if (place.childElementCount === Number(there)) return;
+    const there = state.layers[1] || state.layers[2], text = free || !state.layers[2] ? words.twin : words.ahead;
+    element('free').hidden = !(state.layers[1] && state.layers[2]);
+    if (place.textContent === (there ? text : '')) return;
     const item = document.createElement('span'), line = document.createElement('canvas');
     line.className = 'sample';
     line.setAttribute('aria-hidden', 'true');
-    item.append(line, words.twin);
+    item.append(line, text);
     place.replaceChildren(...there ? [item] : []);
     return void requestAnimationFrame(() => sample(line, '--ghost', [5, 4]));
   }
@@ -546,22 +625,26 @@ function draw() {
     last = frame.number;
     if (frame.newest !== end) {
       end = frame.newest;
+      endAt = performance.now();
       pace();
     }
     for (const curve of frame.curves) {
       const curves = plots[curve.view]?.curves;
-      curves?.set(curve.curve, joined(curves.get(curve.curve), curve, span()[0]));
+      const whole = joined(curves?.get(curve.curve), curve, span()[0]);
+      curves?.set(curve.curve, whole);
+      // Not only its end is new.
+      if (whole === curve && plots[curve.view]) plots[curve.view].plot.moved = null;
     }
   }
   frames = [];
-  if (!asked && !saved) ask();
+  if (!saved && (!asked || newest && askedFor !== lasts())) ask();
   // What nobody sees is not drawn.
   if (state) plots.filter(one => printing || seen.has(one.plot.root)).forEach(picture);
   seek();
   if (cursors) measure();
   if (last >= 0) link.send(`ack ${last}`);
   // A slow computer draws less often, and has time for its operator.
-  if (newest && state?.grows && connected && !calm.matches && !document.hidden) setTimeout(wake, Math.max(EACH - 12, 3 * (performance.now() - now)));
+  if (newest && state?.grows && connected && !calm.matches && !document.hidden) setTimeout(wake, Math.max(EACH, 3 * (performance.now() - now)));
   // The sentences for screen readers change at most twice a second, and once at the end.
   if (now - told > 500) tell(); else { clearTimeout(telling); telling = setTimeout(tell, 500); }
 }
@@ -574,12 +657,12 @@ function picture(one) {
   for (const [number, curve] of one.curves) {
     const { signal, layer } = parts(number);
     // A frame that was on its way when the experiment changed may hold curves of other canvases.
-    if (!state.layers[layer] || !canvas.signals.includes(signal)) continue;
-    lines.push({ ...curve, ...look(canvas, number), step: hello.signals[signal].boolean, layer });
+    if (!state.layers[layer] || !drawn(layer) || !canvas.signals.includes(signal)) continue;
+    lines.push({ ...curve, ...look(canvas, number), curve: number, step: hello.signals[signal].boolean, layer });
   }
   // The latest run on top.
   lines.sort((a, b) => Number(b.ghost) - Number(a.ghost));
-  plot.draw(lines, plot.plane ? null : span());
+  plot.draw(lines, plot.plane ? null : span(), !plot.plane && !!newest && !!state.grows && !printing);
   if (!plot.plane) plot.drawMarks(pointer, state.events ?? [], [...cursorTimes() ?? [], ...trigger?.at ? [trigger.at] : []]);
   for (const item of plot.names.children) {
     const own = /** @type {HTMLElement} */ (item), curve = one.curves.get(Number(own.dataset.curve)), value = own.querySelector('b');
@@ -587,7 +670,7 @@ function picture(one) {
     const at = plot.plane ? curve.y[curve.y.length - 1] : valueAt(curve, pointer ?? span()[1]);
     const text = number(at, 4);
     if (value.textContent !== text) value.textContent = text;
-    const rms = state.rms?.[Number(own.dataset.curve)], place = own.querySelector('small'), off = plot.plane || typeof rms !== 'number' ? '' : words.rms(rms);
+    const rms = (free || !state.layers[2] ? state.rms : state.ahead)?.[Number(own.dataset.curve)], place = own.querySelector('small'), off = plot.plane || typeof rms !== 'number' ? '' : words.rms(rms);
     if (place && place.textContent !== off) place.textContent = off;
   }
 }
@@ -617,7 +700,7 @@ function toggleCursors() {
         wake();
       };
       return slider;
-    }), document.createElement('table'));
+    }), ...saved ? [] : [button(words.csv, askCsv)], document.createElement('table'));
   }
   wake();
 }
@@ -679,6 +762,26 @@ function measure() {
       old.setAttribute('aria-label', own.getAttribute('aria-label') ?? '');
     } else if (cell.textContent !== after[i].textContent) cell.textContent = after[i].textContent;
   });
+}
+
+/** Asks for the points between the cursors, of all curves in the table. */
+function askCsv() {
+  const times = cursorTimes(), curves = plots.filter(one => !one.plot.plane).flatMap(one => [...one.curves.keys()]);
+  const shown = [...new Set(curves.filter(curve => parts(curve).layer === baseLayer()))].slice(0, 64);
+  if (times && shown.length) link.send(`csv ${questions += 1} ${times[0]} ${times[1]} ${shown.join(',')}`);
+}
+
+/** Offers a table as a file. @param {any} what */
+function written(what) {
+  const names = what.curves.map((/** @type {number} */ curve) => {
+    const { signal, case: at } = parts(curve), { label, unit } = hello.signals[signal];
+    return `${[label, hello.cases[at]].filter(Boolean).join(', ')}${unit && ` [${unit}]`}`.replaceAll(',', ';');
+  });
+  const file = document.createElement('a');
+  file.href = URL.createObjectURL(new Blob([`t [s],${names.join(',')}\n${what.rows}`], { type: 'text/csv' }));
+  file.download = `${hello.title}.csv`;
+  file.click();
+  setTimeout(() => URL.revokeObjectURL(file.href), 10000);
 }
 
 /** A choice with a name. @param {string} name @param {[string, string][]} of @param {() => void} act */
@@ -856,13 +959,22 @@ function start() {
   measures.id = 'measure';
   shown.id = 'legend';
   shown.className = 'legend';
+  const alone = button(words.free, () => {
+    free = !free;
+    alone.setAttribute('aria-pressed', String(free));
+    plots.forEach(one => { one.plot.moved = null; });
+    legend();
+    wake();
+  }, false);
+  alone.id = 'free';
+  alone.hidden = true;
   const triggered = button(words.trigger, toggleTrigger, false);
   triggered.id = 'triggered';
   element('word-name').textContent = words.word;
   element('mark').textContent = words.mark;
   element('mark').onclick = mark;
   input('word').onkeydown = event => { if (event.key === 'Enter') mark(); };
-  tools.append(button(words.whole, () => move(null)), button(words.newest, home), button(words.closer, () => zoom(0.5)), button(words.wider, () => zoom(2)), values, measures, ...saved ? [] : [triggered], shown);
+  tools.append(button(words.whole, () => move(null)), button(words.newest, home), button(words.closer, () => zoom(0.5)), button(words.wider, () => zoom(2)), values, measures, ...saved ? [] : [triggered], alone, shown);
   addEventListener('keydown', event => {
     const target = /** @type {HTMLElement} */ (event.target);
     if (event.key === 'Escape' && hello?.kind === 'rig') return stop();
@@ -879,6 +991,14 @@ function start() {
       act();
     }
   });
+  // Data that stand still must not look like a rig that stands still.
+  if (!saved) setInterval(() => {
+    const age = (performance.now() - endAt) / 1000, place = element('age');
+    place.hidden = !(hello?.grows && state?.grows && end > 0 && age > 1);
+    if (!place.hidden) place.textContent = words.old(age);
+  }, 250);
+  // A page that is silent does not operate.
+  if (!saved) setInterval(() => { if (hello?.kind === 'rig') link.send('here'); }, 1000);
   new ResizeObserver(resize).observe(element('curves'));
   matchMedia('(prefers-color-scheme: dark)').addEventListener('change', () => { plots.forEach(names); if (state) legend(); resize(); wake(); });
   addEventListener('beforeprint', () => { printing = true; resize(); draw(); });

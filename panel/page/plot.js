@@ -20,8 +20,26 @@ function airy(low, high) {
   return [low - space, high + space];
 }
 
+/** On what the theme depends, and what that was. */
+const themes = ['(prefers-color-scheme: dark)', '(forced-colors: active)'].map(query => matchMedia(query));
+let theme = '';
+/** Colours of the theme, by name. @type {Map<string, string>} */
+const known = new Map();
+
 /** @param {CanvasRenderingContext2D} ctx @param {string} name */
-const colour = (ctx, name) => getComputedStyle(ctx.canvas).getPropertyValue(name).trim();
+function colour(ctx, name) {
+  const now = themes.map(one => one.matches).join();
+  if (now !== theme) known.clear();
+  theme = now;
+  let found = known.get(name);
+  if (found === undefined) known.set(name, found = getComputedStyle(ctx.canvas).getPropertyValue(name).trim());
+  return found;
+}
+
+/** Seconds before the right edge in which a moving picture is drawn anew each time: the last column grows. */
+const ANEW = 0.3;
+/** On and off in the dashes of a moving line, pixels: they are counted from time 0 and so move with it. */
+const MOVING_DASH = [5, 4];
 
 export const COLOURS = ['--c0', '--c1', '--c2', '--c3'];
 export const DASHES = [[], [8, 4], [2, 3], [10, 3, 2, 3]];
@@ -46,7 +64,7 @@ export function sample(canvas, name, dash) {
 }
 
 /**
- * @typedef {{ x: Float64Array, y: Float64Array, colour: string, dash: number[], ghost: boolean, step: boolean }} Line
+ * @typedef {{ x: Float64Array, y: Float64Array, colour: string, dash: number[], ghost: boolean, step: boolean, curve: number }} Line
  */
 
 /** One canvas with its axes, over time (`plane` false) or in the plane. */
@@ -77,6 +95,9 @@ export class Plot {
     this.range = [0, 1];
     this.shrunk = 0;
     this.empty = true;
+    this.blank = true;
+    /** What the moving picture shows: its last pixel, counted from time 0, and all on which the others depend. @type {{ n: number, key: string } | null} */
+    this.moved = null;
     this.title = '';
   }
 
@@ -90,6 +111,7 @@ export class Plot {
       canvas.height = height;
     }
     [this.width, this.height] = [box.width, box.height];
+    this.moved = null;
     return true;
   }
 
@@ -106,10 +128,19 @@ export class Plot {
   fromX(x) { return this.span[0] + (x - LEFT) / (this.width - LEFT - RIGHT) * (this.span[1] - this.span[0]); }
 
   /**
-   * Draws lines. Ranges grow at once and shrink only where nothing has grown for a second.
-   * @param {Line[]} lines @param {[number, number] | null} span
+   * Draws lines. Ranges grow at once and shrink only where nothing has grown for a second. A picture that moves is shifted
+   * by whole pixels, and only its right edge is drawn.
+   * @param {Line[]} lines @param {[number, number] | null} span @param {boolean} [moves]
    */
-  draw(lines, span) {
+  draw(lines, span, moves = false) {
+    const pixels = Math.round((this.width - LEFT - RIGHT) * devicePixelRatio);
+    let n = 0, each = 0;
+    if (span && moves) {
+      // The same each time, in spite of rounding.
+      each = Number(((span[1] - span[0]) / pixels).toPrecision(9));
+      n = Math.floor(span[1] / each);
+      span = [(n - pixels) * each, n * each];
+    }
     let low = Infinity, high = -Infinity, left = Infinity, right = -Infinity;
     for (const line of lines) {
       for (let i = 0; i < line.x.length; i++) {
@@ -134,21 +165,46 @@ export class Plot {
     }
     if (span) this.span = span; else this.span = /** @type {[number, number]} */ (airy(left, right));
     this.drawGrid();
-    const ctx = this.context(this.curves);
+    const bottom = this.height - BOTTOM, edge = this.width - RIGHT;
+    const key = moves ? [each, this.range, themes.map(one => one.matches), lines.map(line => [line.colour, line.dash, line.curve])].join() : '';
+    const by = moves && this.moved?.key === key ? n - this.moved.n : -1;
+    this.moved = moves ? { n, key } : null;
+    let from = LEFT;
+    const ctx = /** @type {CanvasRenderingContext2D} */ (this.curves.getContext('2d'));
     ctx.save();
+    if (by >= 0 && by < pixels) {
+      const ratio = devicePixelRatio;
+      from = Math.max(LEFT, edge - (by + Math.ceil(ANEW / each) + 2) / ratio);
+      // On whole device pixels, so that the seam is none.
+      from = Math.ceil(from * ratio) / ratio;
+      ctx.setTransform(1, 0, 0, 1, 0, 0);
+      if (by > 0) {
+        ctx.globalCompositeOperation = 'copy';
+        ctx.drawImage(this.curves, -by, 0);
+        ctx.globalCompositeOperation = 'source-over';
+      }
+      ctx.setTransform(ratio, 0, 0, ratio, 0, 0);
+      // What was shifted out to the left, too.
+      ctx.clearRect(0, 0, LEFT, this.height);
+      ctx.clearRect(from, 0, this.width - from, this.height);
+    } else {
+      this.context(this.curves);
+    }
     ctx.beginPath();
-    ctx.rect(LEFT, TOP, this.width - LEFT - RIGHT, this.height - TOP - BOTTOM);
+    ctx.rect(from, TOP, edge - from, bottom - TOP);
     ctx.clip();
     ctx.lineJoin = 'round';
     for (const line of lines) {
       ctx.strokeStyle = colour(ctx, line.colour);
       ctx.lineWidth = line.ghost ? 1.3 : 1.6;
-      ctx.setLineDash(line.dash);
+      const dashes = moves && line.dash.length > 0;
+      ctx.setLineDash(dashes ? [] : line.dash);
       ctx.beginPath();
       let pen = false, before = 0;
-      for (let i = 0; i < line.x.length; i++) {
+      for (let i = from > LEFT ? Math.max(0, after(line.x, this.fromX(from)) - 2) : 0; i < line.x.length; i++) {
         const y = line.y[i];
         if (!Number.isFinite(y)) { pen = false; continue; }
+        if (dashes && (Math.floor(line.x[i] / each) % (MOVING_DASH[0] + MOVING_DASH[1])) >= MOVING_DASH[0]) { pen = false; continue; }
         const px = this.atX(line.x[i]), py = this.atY(y);
         if (!pen) ctx.moveTo(px, py);
         else if (line.step) { ctx.lineTo(px, before); ctx.lineTo(px, py); } else ctx.lineTo(px, py);
@@ -203,6 +259,10 @@ export class Plot {
 
   /** The pointer, events, cursors. @param {number | null} pointer @param {{ t: number, kind: string }[]} events @param {number[]} cursors */
   drawMarks(pointer, events, cursors) {
+    const [left, right] = this.span, inside = events.filter(event => event.t >= left && event.t <= right);
+    const blank = inside.length === 0 && cursors.length === 0 && pointer === null;
+    if (blank && this.blank) return;
+    this.blank = blank;
     const ctx = this.context(this.marks);
     ctx.lineWidth = 1;
     const line = (/** @type {number} */ t, /** @type {string} */ name, /** @type {number[]} */ dash) => {
@@ -215,7 +275,7 @@ export class Plot {
       ctx.lineTo(x, this.height - BOTTOM);
       ctx.stroke();
     };
-    for (const event of events) line(event.t, { bad: '--bad', warning: '--warning', good: '--good' }[event.kind] ?? '--faint', [2, 3]);
+    for (const event of inside) line(event.t, { bad: '--bad', warning: '--warning', good: '--good' }[event.kind] ?? '--faint', [2, 3]);
     for (const cursor of cursors) line(cursor, '--text', [6, 3]);
     if (pointer !== null) line(pointer, '--faint', []);
   }
@@ -226,13 +286,19 @@ export class Plot {
   }
 }
 
-/** The value of a curve at a time. @param {{ x: Float64Array, y: Float64Array }} curve @param {number} t */
-export function valueAt(curve, t) {
-  let low = 0, high = curve.x.length;
+/** How many numbers of a rising list are not above a value. @param {Float64Array} x @param {number} value */
+function after(x, value) {
+  let low = 0, high = x.length;
   while (low < high) {
     const middle = (low + high) >> 1;
-    if (curve.x[middle] <= t) low = middle + 1; else high = middle;
+    if (x[middle] <= value) low = middle + 1; else high = middle;
   }
+  return low;
+}
+
+/** The value of a curve at a time. @param {{ x: Float64Array, y: Float64Array }} curve @param {number} t */
+export function valueAt(curve, t) {
+  const low = after(curve.x, t);
   if (low === 0 || low > curve.x.length) return NaN;
   if (low === curve.x.length) return curve.y[low - 1];
   const [x0, x1, y0, y1] = [curve.x[low - 1], curve.x[low], curve.y[low - 1], curve.y[low]];

@@ -4,6 +4,7 @@
 
 use crate::recording::{Played, Recording};
 use crate::server::Bell;
+use crate::twin::Ahead;
 use abi::Instance;
 use abi::rig::Rig;
 use runtime::hil::control::Control;
@@ -52,8 +53,26 @@ pub fn read_on(reader: &mut Reader, recording: &mut Recording) -> Result<u64, St
 /// Longest dry run beside a recording, s.
 const TWIN: f64 = 60.0;
 
-/// Makes the dry run of a recording whose model has taken over, in a thread of its own.
+/// Cycles of a short run of the model: until the next full state.
+const AHEAD: u64 = 1000;
+
+/// Makes the dry runs of a recording, in threads of their own: one from arming on, and one from each full state.
 pub fn twin(played: &Arc<Played>, bell: &Bell) {
+    if let Some(mut next) = played.recording().wants_ahead(false) {
+        let (played, bell) = (played.clone(), bell.clone());
+        std::thread::spawn(move || {
+            loop {
+                let made = Ahead::run(&next, AHEAD);
+                let mut recording = played.recording();
+                recording.runs_ahead(made);
+                let more = recording.wants_ahead(true);
+                drop(recording);
+                bell.ring();
+                let Some(more) = more else { break };
+                next = more;
+            }
+        });
+    }
     let Some(twin) = played.recording().wants_twin() else { return };
     let (played, bell) = (played.clone(), bell.clone());
     std::thread::spawn(move || {

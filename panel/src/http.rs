@@ -67,8 +67,8 @@ pub fn head(stream: &mut TcpStream) -> io::Result<Result<Head, Answer>> {
     }
 }
 
-/// Judges a head. `port`: ours.
-pub fn answer(head: &[u8], port: u16) -> Answer {
+/// Judges a head. `ours`: the names, with their ports, under which the page is asked for.
+pub fn answer(head: &[u8], ours: &[String]) -> Answer {
     const BAD: &str = "400 Bad Request";
     let mut headers = [httparse::EMPTY_HEADER; 64];
     let mut request = httparse::Request::new(&mut headers);
@@ -83,7 +83,6 @@ pub fn answer(head: &[u8], port: u16) -> Answer {
             _ => None,
         }
     };
-    let ours = [format!("127.0.0.1:{port}"), format!("localhost:{port}")];
     if !one("host").is_some_and(|host| ours.iter().any(|own| own == host)) {
         return Answer::Refused("421 Misdirected Request", "this panel is only at the address in its link");
     }
@@ -143,8 +142,12 @@ pub fn response(answer: &Answer) -> Vec<u8> {
 mod tests {
     use super::*;
 
+    fn ours() -> [String; 2] {
+        ["127.0.0.1:7420", "localhost:7420"].map(String::from)
+    }
+
     fn status(head: &str) -> String {
-        match answer(head.as_bytes(), 7420) {
+        match answer(head.as_bytes(), &ours()) {
             Answer::File(file) => file.path.into(),
             Answer::Socket(accept) => accept,
             Answer::Refused(status, _) => status[..3].into(),
@@ -341,7 +344,7 @@ mod tests {
                     _ => bytes.insert(at, chance.below(256) as u8),
                 }
             }
-            if let Answer::Socket(_) = answer(&bytes, 7420) {
+            if let Answer::Socket(_) = answer(&bytes, &ours()) {
                 let text = String::from_utf8_lossy(&bytes).to_ascii_lowercase();
                 let origin = text.lines().find_map(|line| line.strip_prefix("origin:")).map(str::trim);
                 assert_eq!(origin, Some("http://127.0.0.1:7420"), "seed {seed}");
@@ -352,7 +355,7 @@ mod tests {
     #[test]
     fn responses_forbid_everything_that_the_page_does_not_need() {
         let text =
-            String::from_utf8(response(&answer(format!("GET / HTTP/1.1\r\n{OWN}\r\n").as_bytes(), 7420))).unwrap();
+            String::from_utf8(response(&answer(format!("GET / HTTP/1.1\r\n{OWN}\r\n").as_bytes(), &ours()))).unwrap();
         for header in
             ["default-src 'none'", "frame-ancestors 'none'", "nosniff", "no-referrer", "no-store", "Connection: close"]
         {

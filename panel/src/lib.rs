@@ -12,6 +12,8 @@ pub mod thin;
 pub mod measures;
 pub mod line;
 pub mod subject;
+pub mod chair;
+pub mod rows;
 pub mod page;
 pub mod report;
 mod http;

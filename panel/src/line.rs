@@ -10,8 +10,10 @@
 //! path ID SIGNAL,SIGNAL FROM TO           the second over the first
 //! drop ID                                 of either
 //! between NUMBER FROM TO CURVE,…          what `expect` measures between two instants, s
+//! csv NUMBER FROM TO CURVE,…              the points of curves between two instants, s, as the rows of a table
 //! find NUMBER CURVE rises|falls VALUE FROM  when the curve first passes a value after that instant
 //! ack FRAME                               this frame is drawn
+//! here                                    the page is there; at least once a second
 //! NUMBER WORDS                            for the subject; answered under this number
 //! ```
 
@@ -85,10 +87,14 @@ pub enum Line<'a> {
     Drop(u16),
     /// Measures of curves from one instant to another, answered under this number.
     Between(u32, f64, f64, Vec<u32>),
+    /// Points of curves from one instant to another as rows, answered under this number.
+    Csv(u32, f64, f64, Vec<u32>),
     /// When a curve first passes a value after an instant, answered under this number.
     Find(u32, Crossing),
     /// This frame is drawn.
     Ack(u32),
+    /// The page is there.
+    Here,
     /// Words for the subject.
     Say(u32, &'a str),
 }
@@ -121,31 +127,48 @@ pub fn read(text: &str) -> Result<Line<'_>, String> {
             Ok(Line::View(view))
         }
         ("drop", [id]) => Ok(Line::Drop(number(id, "the number of a view")?)),
+        ("here", []) => Ok(Line::Here),
         ("ack", [frame]) => Ok(Line::Ack(number(frame, "the number of a frame")?)),
-        ("between", [number, from, to, curves]) => {
-            let curves: Vec<u32> =
-                curves.split(',').map(|one| self::number(one, "a curve")).collect::<Result<_, _>>()?;
-            if curves.len() > MEASURED {
-                return Err(format!("at most {MEASURED} curves are measured at once"));
+        (word @ ("between" | "csv"), [number, from, to, curves]) => {
+            let (number, curves) = (self::number(number, "a number")?, curves.split(','));
+            let curves: Vec<u32> = curves.map(|one| self::number(one, "a curve")).collect::<Result<_, _>>()?;
+            let most = if word == "csv" { SIGNALS } else { MEASURED };
+            if curves.len() > most {
+                return Err(format!("at most {most} curves are measured or written at once"));
             }
             let (from, to) = (instant(from)?, instant(to)?);
             if from >= to {
                 return Err(format!("a window goes from one time to a later one, not from {from} to {to}"));
             }
-            Ok(Line::Between(self::number(number, "a number")?, from, to, curves))
+            Ok(if word == "csv" {
+                Line::Csv(number, from, to, curves)
+            } else {
+                Line::Between(number, from, to, curves)
+            })
         }
         ("find", [number, curve, way @ ("rises" | "falls"), level, after]) => {
             let (curve, rises) = (self::number(curve, "a curve")?, *way == "rises");
             let crossing = Crossing { curve, rises, level: instant(level)?, after: instant(after)? };
             Ok(Line::Find(self::number(number, "a number")?, crossing))
         }
-        ("key" | "view" | "path" | "drop" | "ack" | "between" | "find", _) => {
+        ("key" | "view" | "path" | "drop" | "ack" | "between" | "csv" | "find" | "here", _) => {
             Err(format!("`{word}` needs other words after it"))
         }
         (number, [_, ..]) if number.bytes().all(|byte| byte.is_ascii_digit()) => {
             Ok(Line::Say(self::number(number, "a number")?, rest))
         }
-        _ => Err("a line begins with `view`, `path`, `drop`, `between`, `find`, `ack`, or a number".into()),
+        _ => {
+            Err("a line begins with `view`, `path`, `drop`, `between`, `csv`, `find`, `ack`, `here`, or a number"
+                .into())
+        }
+    }
+}
+
+/// Words for a rig: the end of the data that the page has seen, s, and the command.
+pub fn seen(words: &str) -> (Option<f64>, &str) {
+    match words.strip_prefix('@').and_then(|rest| rest.split_once(' ')) {
+        Some((seen, rest)) => (seen.parse().ok(), rest.trim()),
+        None => (None, words.trim()),
     }
 }
 
@@ -203,7 +226,13 @@ mod tests {
         assert_eq!(read("path 5 1,2 0 10"), Ok(view(5, &[1, 2], Window::Span(0.0, 10.0), None)));
         assert_eq!(read("view 1 2 last 24 600"), Ok(view(1, &[2], Window::Last(24.0), Some(600))));
         assert_eq!(read("ack 17"), Ok(Line::Ack(17)));
+        assert_eq!(read("here"), Ok(Line::Here));
+        assert_eq!(
+            (seen("@1.5 arm"), seen("@x stop"), seen("stop")),
+            ((Some(1.5), "arm"), (None, "stop"), (None, "stop"))
+        );
         assert_eq!(read("between 4 1.5 2e1 0,3"), Ok(Line::Between(4, 1.5, 20.0, vec![0, 3])));
+        assert_eq!(read("csv 4 1.5 2e1 7"), Ok(Line::Csv(4, 1.5, 20.0, vec![7])));
         let crossing = Crossing { curve: 2, rises: false, level: -0.5, after: 3.0 };
         assert_eq!(read("find 9 2 falls -0.5 3"), Ok(Line::Find(9, crossing)));
         assert_eq!(read("drop 3\n"), Ok(Line::Drop(3)));
@@ -240,6 +269,7 @@ mod tests {
             ("find 1 0 rises nan 0", "no finite number"),
             ("path 1 0,1,2 all", "a path has two signals"),
             ("ack -1", "`-1` is not the number of a frame"),
+            ("here 1", "`here` needs other words"),
             ("drop \u{202e}", "`\\u{202e}` is not the number of a view"),
         ] {
             let found = read(line);
@@ -259,8 +289,10 @@ mod tests {
             "view",
             "path",
             "drop",
+            "here",
             "ack",
             "between",
+            "csv",
             "find",
             "rises",
             "falls",
@@ -295,7 +327,7 @@ mod tests {
                 state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
                 (state >> 33) as usize % n
             };
-            let first = WORDS[below(10)];
+            let first = WORDS[below(12)];
             let more: Vec<&str> = (0..below(6)).map(|_| WORDS[below(WORDS.len())]).collect();
             let line = format!("{first} {}", more.join(" "));
             let again = match read(&line) {
@@ -320,11 +352,17 @@ mod tests {
                     let curves: Vec<String> = curves.iter().map(u32::to_string).collect();
                     format!("between {number} {from} {to} {}", curves.join(","))
                 }
+                Ok(Line::Csv(number, from, to, curves)) => {
+                    assert!(from < to && curves.len() <= SIGNALS, "seed {seed}: {line}");
+                    let curves: Vec<String> = curves.iter().map(u32::to_string).collect();
+                    format!("csv {number} {from} {to} {}", curves.join(","))
+                }
                 Ok(Line::Find(number, Crossing { curve, rises, level, after })) => {
                     format!("find {number} {curve} {} {level} {after}", if rises { "rises" } else { "falls" })
                 }
                 Ok(Line::Drop(id)) => format!("drop {id}"),
                 Ok(Line::Ack(frame)) => format!("ack {frame}"),
+                Ok(Line::Here) => "here".into(),
                 Ok(Line::Key(key)) => format!("key {key}"),
                 Ok(Line::Say(number, words)) => format!("{number} {words}"),
                 Err(why) => {

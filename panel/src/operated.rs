@@ -9,27 +9,32 @@
 //!                   now NS                the time of its monotonic clock, several times a second
 //!                   energy SHARE CYCLES   the most that a contact gave back of what it can hold, and cycles without
 //!                                         prediction
-//!                   ok NUMBER             the command of this number has been carried out
+//!                   ok NUMBER CYCLE       the command of this number has been carried out, by this cycle of the log;
+//!                                         without CYCLE where none did
 //!                   refused NUMBER WORDS  it has not, and why
 //!                   over WORDS            how the run ended
+//!                   again                 it may be started again
+//!                   anew                  it is being started again
 //!                   problem WORDS         what the panel cannot show, and why
 //! to the rig        NUMBER COMMAND        as at the prompt
 //!                   NUMBER @NS COMMAND    where the rig tells its time: the last one that came
+//!                   seen                  a page has drawn a picture; at most ten times a second
 //! ```
 
+use crate::chair::Chair;
 use crate::frame::Frame;
 use crate::knob::Knob;
-use crate::line::View;
-use crate::recording::{Played, Recording};
+use crate::line::{self, View};
+use crate::recording::Played;
 use crate::server::Bell;
-use crate::subject::Subject;
+use crate::subject::{Page, Subject};
 use crate::words::clean;
 use abi::live::{Live, Tunable};
 use abi::{Instance, Slot};
 use serde_json::{Value, json};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, VecDeque};
 use std::io::Write;
-use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError, RwLock};
 use std::time::{Duration, Instant};
 
 /// A command is refused if the picture on which it was given is older than this, in s: a click that waited in a dead
@@ -37,6 +42,10 @@ use std::time::{Duration, Instant};
 const OLD: f64 = 1.0;
 /// Commands that wait for their answer; the oldest is forgotten.
 const OPEN: usize = 64;
+/// Answers that are shown, the newest: each page picks its own ones.
+const ANSWERS: usize = 32;
+/// Least interval at which the rig is told that it is seen.
+const SEEN: Duration = Duration::from_millis(100);
 
 /// Time for which the panel of a rig that has ended waits for a page.
 const REMAINS: Duration = Duration::from_secs(5);
@@ -58,16 +67,62 @@ struct Inner {
     next: String,
     over: Option<String>,
     problem: Option<String>,
-    /// Commands without an answer, by number.
-    open: BTreeMap<u64, String>,
+    /// Commands without an answer, by number: whose they are.
+    open: BTreeMap<u64, (Page, String)>,
     last: u64,
     /// The last time that the process told, by its monotonic clock in ns: each command names it.
     now: Option<u64>,
     /// Share of energy given back, and cycles without prediction.
     energy: Option<(f64, u64)>,
-    /// The last answer, and its number.
-    answer: Option<(u64, String, Result<(), String>)>,
+    answers: VecDeque<Answer>,
+    chair: Chair,
+    /// When the rig was told last that it is seen.
+    seen: Option<Instant>,
+    /// The number of the run, from 0.
+    run: u64,
     changes: u64,
+}
+
+impl Inner {
+    /// Before the start-up of a run.
+    fn new(run: u64) -> Inner {
+        Inner {
+            stage: "starting".into(),
+            next: "-".into(),
+            over: None,
+            problem: None,
+            open: BTreeMap::new(),
+            last: 0,
+            now: None,
+            energy: None,
+            answers: VecDeque::new(),
+            chair: Chair::default(),
+            seen: None,
+            run,
+            changes: 1,
+        }
+    }
+}
+
+/// What the rig said to a command.
+struct Answer {
+    number: u64,
+    page: Page,
+    said: String,
+    /// The cycle that took it, if one did; or why it was refused.
+    result: Result<Option<u64>, String>,
+}
+
+impl Answer {
+    fn json(&self) -> Value {
+        json!({
+            "number": self.number,
+            "page": self.page.number,
+            "said": clean(&self.said),
+            "cycle": self.result.as_ref().ok(),
+            "refused": self.result.as_ref().err().map(|why| clean(why)),
+        })
+    }
 }
 
 /// A parameter that may change, and its slot.
@@ -86,7 +141,7 @@ struct Begun {
 pub struct Operated {
     name: String,
     inner: Mutex<Inner>,
-    begun: OnceLock<Begun>,
+    begun: RwLock<Option<Arc<Begun>>>,
     to: Mutex<Box<dyn Write + Send>>,
     bell: Bell,
 }
@@ -94,27 +149,21 @@ pub struct Operated {
 impl Operated {
     /// Before its start-up has asked the drives. `to`: lines to the rig's process.
     pub fn new(name: &str, to: Box<dyn Write + Send>, bell: Bell) -> Operated {
-        let inner = Inner {
-            stage: "starting".into(),
-            next: "-".into(),
-            over: None,
-            problem: None,
-            open: BTreeMap::new(),
-            last: 0,
-            now: None,
-            energy: None,
-            answer: None,
-            changes: 1,
-        };
-        Operated { name: name.into(), inner: Mutex::new(inner), begun: OnceLock::new(), to: Mutex::new(to), bell }
+        let (inner, begun) = (Mutex::new(Inner::new(0)), RwLock::default());
+        Operated { name: name.into(), inner, begun, to: Mutex::new(to), bell }
     }
 
     fn inner(&self) -> MutexGuard<'_, Inner> {
         self.inner.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    fn recording(&self) -> Option<MutexGuard<'_, Recording>> {
-        self.begun.get().map(|begun| begun.played.recording())
+    fn begun(&self) -> Option<Arc<Begun>> {
+        self.begun.read().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
+    /// The number of the run, from 0.
+    pub fn run(&self) -> u64 {
+        self.inner().run
     }
 
     /// Its log has begun. `control`: the program whose parameters change.
@@ -125,8 +174,8 @@ impl Operated {
             let quantity = quantities.iter().find(|quantity| quantity.path == param.path && quantity.slot == slot)?;
             Some(Turned { knob: Knob::new(quantity, control.block()[slot.index()]).tuned(limit), slot })
         });
-        let begun = Begun { played, knobs: knobs.collect() };
-        let _ = self.begun.set(begun);
+        let begun = Arc::new(Begun { played, knobs: knobs.collect() });
+        *self.begun.write().unwrap_or_else(PoisonError::into_inner) = Some(begun);
         self.inner().changes += 1;
         self.bell.ring();
     }
@@ -143,6 +192,14 @@ impl Operated {
             "over" => {
                 (inner.over, inner.next) = (Some(rest.into()), "-".into());
             }
+            "again" if inner.over.is_some() => inner.next = "again".into(),
+            "anew" => {
+                *self.begun.write().unwrap_or_else(PoisonError::into_inner) = None;
+                // Who operates it, and the numbers of commands, go on.
+                let (run, changes) = (inner.run + 1, inner.changes);
+                let (chair, last, answers) = (inner.chair.clone(), inner.last, std::mem::take(&mut inner.answers));
+                *inner = Inner { chair, last, answers, changes, ..Inner::new(run) };
+            }
             "problem" => inner.problem = Some(rest.into()),
             "energy" => {
                 let numbers = rest.split_once(' ');
@@ -154,11 +211,14 @@ impl Operated {
                 return;
             }
             "ok" | "refused" => {
-                let (number, why) = rest.split_once(' ').unwrap_or((rest, ""));
+                let (number, more) = rest.split_once(' ').unwrap_or((rest, ""));
                 let Ok(number) = number.parse() else { return };
-                let Some(said) = inner.open.remove(&number) else { return };
-                let result = if word == "ok" { Ok(()) } else { Err(why.to_string()) };
-                inner.answer = Some((number, said, result));
+                let Some((page, said)) = inner.open.remove(&number) else { return };
+                let result = if word == "ok" { Ok(more.parse().ok()) } else { Err(more.to_string()) };
+                inner.answers.push_back(Answer { number, page, said, result });
+                if inner.answers.len() > ANSWERS {
+                    inner.answers.pop_front();
+                }
             }
             _ => return,
         }
@@ -173,7 +233,7 @@ impl Operated {
     }
 
     /// Nothing more can be heard of the rig. `why`: if it has not told how it ended.
-    pub fn left(&self, why: &str) {
+    pub fn ended(&self, why: &str) {
         if !self.is_over() {
             self.told(&format!("over {why}"));
         }
@@ -187,12 +247,45 @@ impl Operated {
     }
 }
 
+impl Operated {
+    /// A page is there, or has gone: that may change who operates.
+    fn attends(&self, page: Page, there: bool) {
+        let (mut inner, now) = (self.inner(), Instant::now());
+        let before = inner.chair.json();
+        if there {
+            inner.chair.heard(page.number, now);
+        } else {
+            inner.chair.left(page.number, now);
+        }
+        if inner.chair.json() != before {
+            inner.changes += 1;
+            drop(inner);
+            self.bell.ring();
+        }
+    }
+
+    /// Who operates: asked, refused, given.
+    fn seat(&self, page: Page, words: &str) -> Result<String, String> {
+        let (mut inner, now) = (self.inner(), Instant::now());
+        let done = match words {
+            "take" => inner.chair.take(page.number, now),
+            "give" => inner.chair.answer(page.number, true, now),
+            _ => inner.chair.answer(page.number, false, now),
+        };
+        inner.changes += 1;
+        drop(inner);
+        self.bell.ring();
+        done.map(|()| String::new())
+    }
+}
+
 impl Subject for Operated {
     fn hello(&self) -> (u64, Value) {
-        let (number, mut value) = match self.recording() {
-            Some(recording) => (2, recording.hello()),
+        let (run, begun) = (self.run(), self.begun());
+        let (number, mut value) = match &begun {
+            Some(begun) => (2 * run + 2, begun.played.recording().hello()),
             None => (
-                1,
+                2 * run + 1,
                 json!({
                     "title": clean(&self.name), "experiments": [], "cases": [""], "signals": [], "canvases": [],
                     "from": 0, "to": 0, "period": 0.001, "solver": "", "grows": true,
@@ -200,19 +293,23 @@ impl Subject for Operated {
             ),
         };
         value["kind"] = json!("rig");
-        let knobs = self.begun.get().map_or(&[][..], |begun| &begun.knobs);
+        let knobs = begun.as_ref().map_or(&[][..], |begun| &begun.knobs);
         value["knobs"] = knobs.iter().map(|one| one.knob.json()).collect();
         (number, value)
     }
 
     fn state(&self) -> (u64, Value) {
-        let (told, mut value) = match self.recording() {
-            Some(recording) => {
-                let knobs = &self.begun.get().expect("it has a recording").knobs;
+        let begun = self.begun();
+        let (told, mut value) = match &begun {
+            Some(begun) => {
+                let (recording, knobs) = (begun.played.recording(), &begun.knobs);
                 let si = |one: &Turned| recording.set_value(one.slot).unwrap_or(one.knob.own);
                 let mut value = recording.state();
                 value["values"] = knobs.iter().map(|one| one.knob.unit.from_si(si(one))).collect();
                 value["texts"] = knobs.iter().map(|one| one.knob.text(si(one))).collect();
+                let changed = knobs.iter().filter(|one| si(one) != one.knob.own);
+                let set = changed.map(|one| format!("--set '{} = {}'", one.knob.path, one.knob.text(si(one))));
+                value["set"] = set.collect::<Vec<_>>().join(" ").into();
                 (recording.told(), value)
             }
             None => (0, json!({ "values": [], "texts": [], "layers": [true], "kept": [], "set": "", "events": [] })),
@@ -223,51 +320,69 @@ impl Subject for Operated {
         value["energy"] = inner.energy.map(|(share, cycles)| json!({ "share": share, "unpredicted": cycles })).into();
         value["next"] = inner.next.clone().into();
         value["over"] = inner.over.as_deref().map(clean).into();
-        value["answer"] = match &inner.answer {
-            Some((number, said, result)) => json!({
-                "number": number,
-                "said": clean(said),
-                "refused": result.as_ref().err().map(|why| clean(why)),
-            }),
-            None => Value::Null,
-        };
+        value["answers"] = inner.answers.iter().map(Answer::json).collect();
+        value["chair"] = inner.chair.json();
         (told + inner.changes, value)
     }
 
     fn version(&self) -> u64 {
-        self.begun.get().map_or(0, |begun| begun.played.version())
+        self.begun().map_or(0, |begun| begun.played.version())
     }
 
     fn newest(&self) -> f64 {
-        self.begun.get().map_or(0.0, |begun| begun.played.newest())
+        self.begun().map_or(0.0, |begun| begun.played.newest())
     }
 
     fn blocks(&self, view: &View, since: Option<u64>, frame: &mut Frame) {
-        if let Some(begun) = self.begun.get() {
+        if let Some(begun) = self.begun() {
             begun.played.blocks(view, since, frame);
         }
     }
 
     fn points(&self, curve: u32, from: f64, each: &mut dyn FnMut(f64, f64) -> bool) {
-        if let Some(begun) = self.begun.get() {
+        if let Some(begun) = self.begun() {
             begun.played.points(curve, from, each);
         }
     }
 
-    fn say(&self, words: &str) -> Result<String, String> {
-        let (seen, words) = match words.strip_prefix('@').and_then(|rest| rest.split_once(' ')) {
-            Some((seen, rest)) => (seen.parse::<f64>().ok(), rest.trim()),
-            None => (None, words.trim()),
-        };
+    fn here(&self, page: Page) {
+        self.attends(page, true);
+    }
+
+    fn drew(&self, page: Page) {
+        self.attends(page, true);
+        let mut inner = self.inner();
+        if page.guest || inner.seen.is_some_and(|seen| seen.elapsed() < SEEN) {
+            return;
+        }
+        inner.seen = Some(Instant::now());
+        drop(inner);
+        let _ = self.say_line("seen");
+    }
+
+    fn left(&self, page: Page) {
+        self.attends(page, false);
+    }
+
+    fn say(&self, page: Page, words: &str) -> Result<String, String> {
+        let (seen, words) = line::seen(words);
         if words.chars().any(char::is_control) {
             return Err("a command is one line".into());
         }
         // A stop is obeyed with any age, and before anything else is asked.
         let stops = words == "stop";
-        if !stops {
+        if let "take" | "give" | "refuse" = words {
+            return self.seat(page, words);
+        }
+        if words == "again" {
+            if self.inner().next != "again" {
+                return Err("the rig cannot be started again now".into());
+            }
+            self.inner().chair.command(page.number, Instant::now())?;
+        } else if !stops {
             let begins = |word: &str| words.strip_prefix(word).is_some_and(|rest| rest.starts_with(' '));
             if words != "enable" && words != "arm" && !begins("set") && !begins("mark") {
-                return Err("say enable, arm, set PATH = VALUE, mark WORDS or stop".into());
+                return Err("say enable, arm, set PATH = VALUE, mark WORDS, take, give, refuse, again or stop".into());
             }
             if let Some(over) = &self.inner().over {
                 return Err(format!("the rig has ended: {over}"));
@@ -278,19 +393,23 @@ impl Subject for Operated {
             if !(-OLD..=OLD).contains(&age) {
                 return Err(format!("it was given before a picture that is {age:.1} s old: look, and give it again"));
             }
+            self.inner().chair.command(page.number, Instant::now())?;
         }
         let (number, now) = {
             let mut inner = self.inner();
             inner.last += 1;
             let number = inner.last;
-            inner.open.insert(number, words.into());
+            inner.changes += 1;
+            inner.open.insert(number, (page, words.into()));
             if inner.open.len() > OPEN {
                 inner.open.pop_first();
             }
-            (number, inner.now.filter(|_| !stops))
+            (number, inner.now.filter(|_| !stops && words != "again"))
         };
         let stamp = now.map_or(String::new(), |ns| format!("@{ns} "));
         self.say_line(&format!("{number} {stamp}{words}"))?;
+        // Who operates may have changed.
+        self.bell.ring();
         Ok(number.to_string())
     }
 }
@@ -311,6 +430,8 @@ mod tests {
             Ok(())
         }
     }
+
+    const ONE: Page = Page { number: 1, guest: false };
 
     fn open() -> (Operated, Lines) {
         let lines = Lines::default();
@@ -342,7 +463,7 @@ mod tests {
             let (seen, words) = (SEEN[seed % SEEN.len()], WORDS[seed / SEEN.len()]);
             let (operated, lines) = open();
             let said = format!("{seen}{words}");
-            let result = operated.say(&said);
+            let result = operated.say(ONE, &said);
             let written = String::from_utf8(lines.0.lock().unwrap().clone()).unwrap();
             let known = matches!(words, "enable" | "arm" | "set fr.Fs = 1 N");
             let young = matches!(seen, "@0 " | "@0.9 " | "@-0.9 ");
@@ -369,12 +490,15 @@ mod tests {
         let (operated, lines) = open();
         operated.told("stage enable waiting to be enabled");
         assert_eq!(operated.state().1["next"], "enable");
-        operated.say("@0 enable").unwrap();
+        operated.say(ONE, "@0 enable").unwrap();
         let before = operated.state().0;
         operated.told("refused 1 it has no effect now");
         let (after, state) = operated.state();
         assert!(after > before);
-        assert_eq!(state["answer"], json!({ "number": 1, "said": "enable", "refused": "it has no effect now" }));
+        let refused = json!({
+            "number": 1, "page": 1, "said": "enable", "cycle": null, "refused": "it has no effect now",
+        });
+        assert_eq!(state["answers"], json!([refused]));
         // Answers to nothing, and lines that are none, change nothing.
         for line in ["ok 1", "ok", "refused x y", "", "hello", "\u{202e}"] {
             operated.told(line);
@@ -382,13 +506,97 @@ mod tests {
         }
         // A command names the time that the process told last, a stop none.
         operated.told("now 123");
-        operated.say("@0 enable").unwrap();
-        operated.say("stop").unwrap();
+        operated.say(ONE, "@0 enable").unwrap();
+        operated.say(ONE, "stop").unwrap();
         assert!(String::from_utf8(lines.0.lock().unwrap().clone()).unwrap().ends_with("2 @123 enable\n3 stop\n"));
         operated.told("over stopped: enabling switch released");
-        assert!(operated.say("@0 arm").is_err_and(|why| why.contains("enabling switch released")));
-        assert!(operated.say("stop").is_ok());
-        operated.left("lost");
+        assert!(operated.say(ONE, "@0 arm").is_err_and(|why| why.contains("enabling switch released")));
+        assert!(operated.say(ONE, "stop").is_ok());
+        operated.ended("lost");
         assert_eq!(operated.state().1["over"], "stopped: enabling switch released");
+        // It is started again only where that is offered; then nothing of the run before is left but who operates.
+        assert!(operated.say(ONE, "again").is_err());
+        operated.told("again");
+        assert_eq!(operated.state().1["next"], "again");
+        let hello = operated.hello().0;
+        operated.say(ONE, "again").unwrap();
+        operated.told("anew");
+        let (number, state) = operated.state();
+        assert!(number > after && operated.hello().0 > hello && operated.run() == 1);
+        assert_eq!((&state["over"], &state["next"], &state["chair"]["holder"]), (&Value::Null, &json!("-"), &json!(1)));
+        operated.say(ONE, "@0 enable").unwrap();
+        operated.told("ok 6 1234");
+        assert_eq!(operated.state().1["answers"].as_array().unwrap().last().unwrap()["cycle"], 1234);
+    }
+
+    /// Random commands of three pages and a rig that answers them in any order: each answer goes to the page that asked,
+    /// with the cycle that took it; a command of a page that does not operate is not passed on, and each stop is.
+    ///
+    /// Mutants tried: the answer to the last page that asked; a stop that needs the chair; a chair that nobody keeps.
+    #[test]
+    fn each_page_gets_its_own_answers_and_only_one_operates() {
+        for seed in 1..=300_u64 {
+            let mut state = seed;
+            let mut below = |n: u64| {
+                state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+                (state >> 33) % n
+            };
+            let (operated, lines) = open();
+            let (mut waiting, mut holder, mut last) = (Vec::new(), None, 0);
+            for cycle in 0..80 {
+                let page = Page { number: 1 + below(3), guest: false };
+                let before = lines.0.lock().unwrap().len();
+                match below(6) {
+                    0 => {
+                        operated.left(page);
+                        holder = holder.filter(|holder| *holder != page.number);
+                    }
+                    1 => {
+                        operated.say(page, "@-99 stop").unwrap();
+                        last += 1;
+                        assert_eq!(
+                            &lines.0.lock().unwrap()[before..],
+                            format!("{last} stop\n").as_bytes(),
+                            "seed {seed}"
+                        );
+                    }
+                    2 if !waiting.is_empty() => {
+                        let (number, page): (u64, u64) = waiting.remove(below(waiting.len() as u64) as usize);
+                        operated.told(&format!("ok {number} {cycle}"));
+                        let told = operated.state().1["answers"].as_array().unwrap().last().unwrap().clone();
+                        let found = (told["number"].as_u64(), told["page"].as_u64(), told["cycle"].as_u64());
+                        assert_eq!(found, (Some(number), Some(page), Some(cycle)), "seed {seed}");
+                    }
+                    _ => {
+                        let result = operated.say(page, "@0 set a = 1");
+                        let mine = holder.is_none_or(|holder| holder == page.number);
+                        assert_eq!(
+                            result.is_ok(),
+                            mine,
+                            "seed {seed}: page {} while {holder:?}: {result:?}",
+                            page.number
+                        );
+                        if mine {
+                            last += 1;
+                            waiting.push((last, page.number));
+                            holder = Some(page.number);
+                        } else {
+                            assert_eq!(lines.0.lock().unwrap().len(), before, "seed {seed}");
+                        }
+                    }
+                }
+                assert_eq!(operated.state().1["chair"]["holder"].as_u64(), holder, "seed {seed}");
+            }
+        }
+    }
+
+    #[test]
+    fn the_rig_is_told_that_it_is_seen_but_not_by_guests() {
+        let (operated, lines) = open();
+        operated.drew(Page { number: 2, guest: true });
+        assert_eq!(lines.0.lock().unwrap().len(), 0);
+        (0..50).for_each(|_| operated.drew(ONE));
+        let told = String::from_utf8(lines.0.lock().unwrap().clone()).unwrap();
+        assert!(told.starts_with("seen\n") && told.len() < 30, "{told}");
     }
 }

@@ -7,21 +7,22 @@ use crate::frame::{Block, COLUMNS, Frame, PATH};
 use crate::history::History;
 use crate::line::{View, Window};
 use crate::sheet::{Sheet, Signal};
-use crate::subject::Subject;
+use crate::subject::{Page, Subject};
 use crate::thin;
-use crate::twin::{Difference, Twin};
+use crate::twin::{Ahead, Difference, Short, State, Twin};
 use crate::words::clean;
 use abi::format;
 use abi::rig::{Rig, SignalKind};
 use abi::{Description, Instance, Slot};
+use runtime::can::frame_length;
 use runtime::hil::control::{Control, Reading, Source};
-use runtime::hil::trace::{self, Cycle, Shape};
+use runtime::hil::trace::{self, Cycle, Passed, Shape};
 use runtime::hil::words;
 use runtime::record::log::{LOST, Message};
-use runtime::safety::Clamps;
+use runtime::safety::{Clamps, DriveCommand};
 use serde_json::{Value, json};
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
-use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 /// Events that are kept, the newest.
@@ -32,6 +33,12 @@ const BARS: usize = 5 * PARTS;
 /// Points of a path.
 const PATH_POINTS: u64 = 60_000;
 
+/// Share of its time from which a bus is too busy: frames of the cycle would wait.
+const HEAVY: f64 = 0.9;
+
+/// Short runs of the model that are kept, and states from which one waits to be made: the newest.
+const AHEAD: usize = 60;
+
 /// Interval at which counts and the histogram are shown anew while more comes.
 const TELL: Duration = Duration::from_millis(500);
 
@@ -40,6 +47,27 @@ struct Event {
     cycle: u64,
     kind: &'static str,
     text: String,
+}
+
+/// The load of a bus, from the frames in the log.
+#[derive(Clone, Copy, Default)]
+struct Load {
+    /// The second that is counted, and its bits so far.
+    second: u64,
+    bits: u64,
+    /// Bits in the last whole second.
+    last: Option<u64>,
+}
+
+impl Load {
+    fn count(&mut self, second: u64, bits: u32) {
+        if second != self.second {
+            // A second without any frame is 0, and the first one is not whole.
+            self.last = (self.second > 0).then_some(if second == self.second + 1 { self.bits } else { 0 });
+            (self.second, self.bits) = (second, 0);
+        }
+        self.bits += u64::from(bits);
+    }
 }
 
 /// A recording.
@@ -70,8 +98,10 @@ pub struct Recording {
     told: (u64, Instant),
     /// Parameters that were set while it ran, SI.
     set: BTreeMap<Slot, f64>,
-    /// Both programs of the rig at their start, until the dry run is made.
-    programs: Option<(Instance, Instance)>,
+    /// Both programs of the rig at their start.
+    programs: Arc<(Instance, Instance)>,
+    /// Whether the dry run from arming on has been begun.
+    twins: bool,
     /// When the model took over, in cycles, and what was set before.
     armed: Option<(u64, Vec<(Slot, f64)>)>,
     twin: Vec<Vec<(f64, f64)>>,
@@ -80,6 +110,15 @@ pub struct Recording {
     twin_from: u64,
     /// Permitted commands and status words of the last cycle.
     last: (Vec<f64>, Vec<u16>),
+    /// What the drives measured in the last cycle, and whether the model ran.
+    measured: (Vec<(abi::rig::Signal, f64)>, bool),
+    /// States from which no short run has been made yet, the oldest first.
+    states: VecDeque<State>,
+    /// Short runs, in the order of time, and where the data ended when the latest came.
+    ahead: (VecDeque<Ahead>, u64),
+    /// Whether somebody makes short runs.
+    running: bool,
+    buses: Vec<Load>,
 }
 
 impl Recording {
@@ -138,12 +177,18 @@ impl Recording {
             first: None,
             told: (1, Instant::now()),
             set: BTreeMap::new(),
-            programs: Some((programs.0.clone(), programs.1.clone())),
+            programs: Arc::new((programs.0.clone(), programs.1.clone())),
+            twins: false,
             armed: None,
             twin: Vec::new(),
             differences: Vec::new(),
             twin_from: 0,
             last: (Vec::new(), Vec::new()),
+            measured: (Vec::new(), false),
+            states: VecDeque::new(),
+            ahead: (VecDeque::new(), 0),
+            running: false,
+            buses: rig.buses.iter().map(|_| Load::default()).collect(),
         }
     }
 
@@ -164,6 +209,18 @@ impl Recording {
                 }
                 None => false,
             },
+            trace::FRAMES => {
+                for passed in Passed::read(&message.words).into_iter().flatten() {
+                    if let Some(load) = self.buses.get_mut(usize::from(passed.bus)) {
+                        load.count(passed.stamp_ns / 1_000_000_000, frame_length::bits(&passed.frame));
+                    }
+                }
+                true
+            }
+            trace::STATE => {
+                self.state_of_cycle(&message.words);
+                true
+            }
             trace::MARK => match trace::read_mark(&message.words) {
                 Some((due_ns, words)) => {
                     self.event(due_ns / self.rig.period_ns, "mark", words);
@@ -203,9 +260,52 @@ impl Recording {
 
     /// The dry run that is to be made, once: when the model has taken over.
     pub fn wants_twin(&mut self) -> Option<Twin> {
-        let (at, set) = self.armed.as_ref()?;
-        let (control, plant) = self.programs.take()?;
+        let (at, set) = self.armed.as_ref().filter(|_| !self.twins)?;
+        let (control, plant) = (*self.programs).clone();
+        self.twins = true;
         Some(Twin { rig: self.rig.clone(), control, plant, set: set.clone(), at: self.seconds(*at) })
+    }
+
+    /// Keeps a full state: the next short run starts there.
+    fn state_of_cycle(&mut self, words: &[u64]) {
+        let size = self.programs.0.block().len();
+        let Some(block) = words.get(2..2 + size).filter(|_| self.measured.1) else { return };
+        let block = block.iter().map(|word| f64::from_bits(*word)).collect();
+        let at = self.history.cycles().end.saturating_sub(1);
+        if self.states.len() == AHEAD {
+            self.states.pop_front();
+        }
+        self.states.push_back(State { at, block, measured: self.measured.0.clone(), permitted: self.last.0.clone() });
+    }
+
+    /// What a short run needs, if one is to be made that nobody makes already: the newest first.
+    pub fn wants_ahead(&mut self, goes_on: bool) -> Option<Short> {
+        if self.running && !goes_on {
+            return None;
+        }
+        let state = self.states.pop_back();
+        self.running = state.is_some();
+        Some(Short { rig: self.rig.clone(), programs: self.programs.clone(), from: state? })
+    }
+
+    /// Shows a short run.
+    pub fn runs_ahead(&mut self, made: Ahead) {
+        let (all, from) = &mut self.ahead;
+        let place = all.partition_point(|other| other.at < made.at);
+        all.insert(place, made);
+        if all.len() > AHEAD {
+            all.pop_front();
+        }
+        *from = self.history.cycles().end;
+        self.tell();
+    }
+
+    /// How much the recording differs from the newest short run that is over, for each recorded quantity.
+    fn rms_ahead(&self) -> Vec<Option<f64>> {
+        let end = self.history.cycles().end;
+        let over = |one: &&Ahead| one.curves.first().is_some_and(|curve| one.at + (curve.len() as u64) < end);
+        let Some(last) = self.ahead.0.iter().rev().find(over) else { return Vec::new() };
+        (0..last.curves.len()).map(|curve| last.rms(curve, |cycle| self.history.value(curve, cycle))).collect()
     }
 
     /// Shows a dry run beside the recorded quantities.
@@ -242,7 +342,20 @@ impl Recording {
                 "value": value, "low": output.low, "high": output.high, "unit": unit.text,
             })
         });
-        json!({ "drives": drives.collect::<Vec<_>>(), "commands": commands.collect::<Vec<_>>() })
+        let buses = self.rig.buses.iter().zip(&self.buses).filter_map(|(bus, load)| {
+            // Some adapters set no bit rate: then nothing is known of the load.
+            let share = load.last.filter(|_| bus.bit_rate > 0)? as f64 / f64::from(bus.bit_rate);
+            let kind = if share < HEAVY { "good" } else { "bad" };
+            Some(json!({ "name": clean(&bus.name), "kind": kind, "words": format!("{:.0} % busy", 100.0 * share) }))
+        });
+        let log = match self.lost {
+            0 => json!({ "name": "log", "kind": "good", "words": "whole" }),
+            lost => json!({
+                "name": "log", "kind": "bad", "words": format!("{} messages lost", format::count(lost)),
+            }),
+        };
+        let drives: Vec<Value> = drives.chain(buses).chain([log]).collect();
+        json!({ "drives": drives, "commands": commands.collect::<Vec<_>>() })
     }
 
     /// The number of [`Recording::state`].
@@ -298,6 +411,10 @@ impl Recording {
         for ((difference, twin), value) in self.differences.iter_mut().zip(&self.twin).zip(&self.row) {
             difference.see(twin, t, *value);
         }
+        self.measured.0.clear();
+        let known = cycle.readings.iter().zip(&self.signals).filter(|(reading, _)| reading.age != Reading::NEVER);
+        self.measured.0.extend(known.map(|(reading, signal)| (*signal, reading.value)));
+        self.measured.1 = cycle.source == Source::Model && cycle.order == DriveCommand::Follow;
         self.last.0.clone_from(&cycle.permitted);
         self.last.1.clone_from(&cycle.statuses);
         if cycle.arms && cycle.source == Source::Model && self.armed.is_none() {
@@ -474,9 +591,10 @@ impl Recording {
         json!({
             "values": [],
             "texts": [],
-            "layers": [true, !self.twin.is_empty()],
+            "layers": [true, !self.twin.is_empty(), !self.ahead.0.is_empty()],
             "kept": [],
             "rms": self.differences.iter().map(Difference::rms).collect::<Vec<_>>(),
+            "ahead": self.rms_ahead(),
             "standing": self.standing(),
             "words": clean(&words),
             "set": "",
@@ -493,6 +611,34 @@ impl Recording {
                 "missed": self.missed,
             },
         })
+    }
+
+    /// The curves of the short runs, with gaps between them: again when there is another one.
+    fn ahead_blocks(&self, view: &View, columns: usize, since: Option<u64>, frame: &mut Frame) {
+        let (all, made) = &self.ahead;
+        if since.is_some_and(|since| since > *made) || all.is_empty() {
+            return;
+        }
+        let (begin, end) = self.extent(self.history.cycles().end);
+        let (from, to) = view.window.within(begin, end);
+        for signal in view.signals.iter().filter(|signal| (**signal as usize) < self.rig.record.len()) {
+            let mut out: Vec<(f64, f64)> = Vec::new();
+            for one in all {
+                let curve = &one.curves[*signal as usize];
+                let (first, last) = (self.seconds(one.at + 1), self.seconds(one.at + curve.len() as u64));
+                if curve.is_empty() || last < from || first > to + self.seconds(curve.len() as u64) {
+                    continue;
+                }
+                let points: Vec<(f64, f64)> =
+                    curve.iter().zip(one.at + 1..).map(|(y, k)| (self.seconds(k), *y)).collect();
+                let part = ((last - first) / (to - from) * columns as f64).ceil().clamp(2.0, 1e4) as usize;
+                out.extend(thin::window(&points, first, last, part));
+                out.push((last, f64::NAN));
+            }
+            let first = out.first().map_or(0.0, |point| point.0);
+            let curve = 2 * self.sheet.signals.len() as u32 + signal;
+            frame.path(Block { kind: PATH, view: view.id, curve, cycles: 0, first }, &out);
+        }
     }
 
     /// The curves of the dry run: once, and again for another window.
@@ -549,6 +695,7 @@ impl Recording {
                 frame.columns(block, &pairs);
             }
             self.twin_blocks(view, columns as usize, since, frame);
+            self.ahead_blocks(view, columns as usize, since, frame);
         } else if let [x, y] = view.signals[..] {
             let (begin, end) = self.extent(all.end);
             let (from, to) = view.window.within(begin, end);
@@ -605,7 +752,7 @@ impl Subject for Played {
         self.recording().points(curve, from, each);
     }
 
-    fn say(&self, _: &str) -> Result<String, String> {
+    fn say(&self, _: Page, _: &str) -> Result<String, String> {
         Err("a recording obeys nobody".into())
     }
 }

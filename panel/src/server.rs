@@ -1,4 +1,5 @@
-//! The server: listens on this computer alone, and gives each connection its threads.
+//! The server: listens on this computer alone, and at an address for others if that is asked for; gives each connection
+//! its threads.
 
 use crate::http::{self, Answer};
 use crate::key::Key;
@@ -6,7 +7,7 @@ use crate::subject::Subject;
 pub use crate::viewer::Bell;
 use crate::viewer::Viewer;
 use std::io::{self, Write};
-use std::net::{Ipv4Addr, Shutdown, TcpListener, TcpStream};
+use std::net::{Ipv4Addr, Shutdown, SocketAddr, TcpListener, TcpStream};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::thread;
@@ -20,19 +21,28 @@ const PORTS: u16 = 20;
 const CONNECTIONS: usize = 32;
 /// Sockets that have not sent the key.
 const STRANGERS: usize = 8;
-/// Sockets that have.
+/// Sockets that have, at each address.
 const VIEWERS: usize = 32;
 /// Bytes of the stack of a thread.
 const STACK: usize = 256 << 10;
 
 /// An open panel.
 pub struct Panel {
+    own: Door,
+    /// For others, who look.
+    share: Option<Door>,
+}
+
+/// An address at which it listens.
+struct Door {
     listener: TcpListener,
     shared: Arc<Shared>,
 }
 
 struct Shared {
-    port: u16,
+    /// The names under which it is asked for, the first one for its link.
+    names: Vec<String>,
+    guests: bool,
     key: Key,
     subject: Arc<dyn Subject>,
     bell: Bell,
@@ -62,15 +72,13 @@ impl Panel {
     /// # Errors
     /// Why it cannot be opened, in words.
     pub fn open(port: u16, subject: Arc<dyn Subject>, bell: Bell) -> Result<Panel, String> {
-        let key = Key::random()?;
         let mut last = String::new();
         for port in (0..PORTS).filter_map(|more| port.checked_add(more)) {
             match TcpListener::bind((Ipv4Addr::LOCALHOST, port)) {
                 Ok(listener) => {
                     let port = listener.local_addr().map_err(|why| why.to_string())?.port();
-                    let (connections, strangers) = (AtomicUsize::new(0), AtomicUsize::new(0));
-                    let shared = Shared { port, key, subject, bell, connections, strangers };
-                    return Ok(Panel { listener, shared: Arc::new(shared) });
+                    let names = vec![format!("127.0.0.1:{port}"), format!("localhost:{port}")];
+                    return Ok(Panel { own: Door::new(listener, names, false, subject, bell)?, share: None });
                 }
                 Err(error) if error.kind() == io::ErrorKind::AddrInUse => last = error.to_string(),
                 Err(error) => return Err(format!("127.0.0.1:{port}: {error}")),
@@ -79,9 +87,36 @@ impl Panel {
         Err(format!("127.0.0.1:{port} and the {} ports after it: {last}; choose another --port", PORTS - 1))
     }
 
+    /// Listens for others too, who look and may stop a rig. They have a key of their own.
+    ///
+    /// # Errors
+    /// Why not, in words.
+    pub fn shared_at(self, address: SocketAddr) -> Result<Panel, String> {
+        if address.ip().is_unspecified() {
+            return Err(format!(
+                "{address} is no address that a page can have: name one of this computer, as `ip address` shows them"
+            ));
+        }
+        let listener = TcpListener::bind(address).map_err(|why| format!("{address}: {why}; choose another --share"))?;
+        let address = listener.local_addr().map_err(|why| why.to_string())?;
+        let mut names = vec![address.to_string()];
+        if address.port() == 80 {
+            // Browsers leave it out.
+            names.push(address.to_string().trim_end_matches(":80").into());
+        }
+        let Shared { subject, bell, .. } = &*self.own.shared;
+        let share = Door::new(listener, names, true, subject.clone(), bell.clone())?;
+        Ok(Panel { share: Some(share), ..self })
+    }
+
     /// The link that opens it.
     pub fn link(&self) -> String {
-        format!("http://127.0.0.1:{}/#{}", self.shared.port, self.shared.key.text())
+        self.own.link()
+    }
+
+    /// The link for others.
+    pub fn share_link(&self) -> Option<String> {
+        self.share.as_ref().map(Door::link)
     }
 
     /// Serves until the process ends.
@@ -89,6 +124,30 @@ impl Panel {
     /// # Errors
     /// Why it can no longer accept connections.
     pub fn serve(self) -> io::Result<()> {
+        if let Some(share) = self.share {
+            thread::Builder::new().name("panel for others".into()).spawn(move || share.serve())?;
+        }
+        self.own.serve()
+    }
+}
+
+impl Door {
+    fn new(
+        listener: TcpListener,
+        names: Vec<String>,
+        guests: bool,
+        subject: Arc<dyn Subject>,
+        bell: Bell,
+    ) -> Result<Door, String> {
+        let (key, connections, strangers) = (Key::random()?, AtomicUsize::new(0), AtomicUsize::new(0));
+        Ok(Door { listener, shared: Arc::new(Shared { names, guests, key, subject, bell, connections, strangers }) })
+    }
+
+    fn link(&self) -> String {
+        format!("http://{}/#{}", self.shared.names[0], self.shared.key.text())
+    }
+
+    fn serve(self) -> io::Result<()> {
         loop {
             let stream = match self.listener.accept() {
                 Ok((stream, _)) => stream,
@@ -119,7 +178,7 @@ impl Shared {
             }
             let _ = stream.set_write_timeout(Some(Duration::from_secs(10)));
             let (answer, rest) = match http::head(&mut stream) {
-                Ok(Ok(head)) => (http::answer(&head.bytes, self.port), head.rest),
+                Ok(Ok(head)) => (http::answer(&head.bytes, &self.names), head.rest),
                 Ok(Err(refused)) => (refused, Vec::new()),
                 Err(_) => return,
             };
@@ -141,7 +200,7 @@ impl Shared {
         let Some(stranger) = Counted::new(&self.strangers, STRANGERS) else { return };
         let _ = stream.set_nodelay(true);
         let Ok(writing) = stream.try_clone() else { return };
-        let viewer = Arc::new(Viewer::default());
+        let viewer = Arc::new(Viewer::new(self.guests));
         let known = AtomicBool::new(false);
         let mut stranger = Some(stranger);
         let is_known = || known.load(Ordering::Acquire);
@@ -157,7 +216,10 @@ impl Shared {
                 known.store(room, Ordering::Release);
                 room
             });
-            self.bell.remove(&viewer);
+            if known.load(Ordering::Acquire) {
+                self.bell.remove(&viewer);
+                self.subject.left(viewer.page());
+            }
         });
     }
 }

@@ -4,6 +4,15 @@ use crate::frame::Frame;
 use crate::line::View;
 use serde_json::Value;
 
+/// A page that is connected.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub struct Page {
+    /// Its number, from 1, in the order of coming.
+    pub number: u64,
+    /// It came through the link for others: it looks, and may stop a rig.
+    pub guest: bool,
+}
+
 /// Something that a panel shows. All methods are called from several threads, and none may wait for long.
 pub trait Subject: Send + Sync {
     /// What does not change while it is shown: its name, signals, plots, parameters; and its number, which changes when
@@ -26,9 +35,18 @@ pub trait Subject: Send + Sync {
     /// point before it, until it returns false.
     fn points(&self, curve: u32, from: f64, each: &mut dyn FnMut(f64, f64) -> bool);
 
-    /// Obeys the words of a page.
+    /// Obeys the words of a page; those of a guest are `stop`.
     ///
     /// # Errors
     /// Why not.
-    fn say(&self, words: &str) -> Result<String, String>;
+    fn say(&self, page: Page, words: &str) -> Result<String, String>;
+
+    /// A page shows that it is there, at least once a second.
+    fn here(&self, _page: Page) {}
+
+    /// A page has drawn a picture.
+    fn drew(&self, _page: Page) {}
+
+    /// A page has gone.
+    fn left(&self, _page: Page) {}
 }

@@ -1,14 +1,18 @@
-//! The model beside the recording of its rig: a dry run from the instant at which the model took over.
+//! The model beside the recording of its rig: a dry run from the instant at which the model took over, and short ones from
+//! each full state in the log.
 //!
-//! In: both programs of a rig, the values of its parameters at that instant, the recording so far. Out: for each recorded
-//! quantity the curve of the dry run, and how far the recording is from it. The control program starts as it does on the
-//! rig, and the plant at its own start; sets after arming are not repeated.
+//! In: both programs of a rig, the values of its parameters or its whole state at an instant, the recording so far. Out: for
+//! each recorded quantity the curve of the dry run, and how far the recording is from it. In the long run the control
+//! program starts as it does on the rig, and the plant at its own start. The short ones start from the true state, and the
+//! plant from what the drives measured; each lasts until the next state is due. Sets after the begin are not repeated.
 
 use abi::plan::{Experiment, PARTS, Plot, Solver, View};
-use abi::rig::{Bench, Rig};
+use abi::rig::{Bench, Rig, Signal};
 use abi::series::Method;
 use abi::{Instance, Slot};
+use runtime::coupling::sil::{self, Moment};
 use runtime::engine::{Continue, run};
+use std::sync::Arc;
 
 /// Steps of the plant in a period: those of a dry run.
 const STEPS: f64 = 50.0;
@@ -59,6 +63,60 @@ impl Twin {
             points.map(Iterator::collect).unwrap_or_default()
         };
         series.iter().map(column).collect()
+    }
+}
+
+/// A full state in the log, from which a short run can start.
+#[derive(Clone, PartialEq, Debug)]
+pub struct State {
+    /// The last cycle before it, counted in periods.
+    pub at: u64,
+    /// The block of the control program.
+    pub block: Vec<f64>,
+    /// What the drives measured in that cycle, SI.
+    pub measured: Vec<(Signal, f64)>,
+    /// The outputs that were permitted then, SI.
+    pub permitted: Vec<f64>,
+}
+
+/// A short run to be made.
+pub struct Short {
+    /// The rig.
+    pub rig: Rig,
+    /// Its control program, and that of its plant.
+    pub programs: Arc<(Instance, Instance)>,
+    /// Where it starts.
+    pub from: State,
+}
+
+/// A short run from a state.
+pub struct Ahead {
+    /// The last cycle before it.
+    pub at: u64,
+    /// For each recorded quantity its values after each of the following cycles, in its unit.
+    pub curves: Vec<Vec<f64>>,
+}
+
+impl Ahead {
+    /// Makes it, for this many cycles; shorter where a program cannot continue.
+    pub fn run(short: &Short, cycles: u64) -> Ahead {
+        let Short { rig, programs, from } = short;
+        let mut curves = vec![Vec::with_capacity(cycles as usize); rig.record.len()];
+        let moment = Moment { control: &from.block, measured: &from.measured, permitted: &from.permitted };
+        sil::ahead(rig, (&programs.0, &programs.1), &moment, (STEPS as u64, cycles), &mut |control| {
+            for (curve, series) in curves.iter_mut().zip(&rig.record) {
+                curve.push(series.unit.from_si(control.get(series.slot)));
+            }
+        });
+        Ahead { at: from.at, curves }
+    }
+
+    /// Root of the mean square of its difference from a recording, for one of its curves. `value`: of a cycle.
+    pub fn rms(&self, curve: usize, value: impl Fn(u64) -> f64) -> Option<f64> {
+        let off = self.curves[curve].iter().zip(self.at + 1..).map(|(own, cycle)| own - value(cycle));
+        let squares = off.map(|off| off * off);
+        let known: Vec<f64> = squares.filter(|square| !square.is_nan()).collect();
+        (!known.is_empty()).then(|| (known.iter().sum::<f64>() / known.len() as f64).sqrt())
     }
 }
 

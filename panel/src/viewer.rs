@@ -11,11 +11,13 @@ use crate::frame::Frame;
 use crate::key::Key;
 use crate::line::{self, Crossing, Line, View};
 use crate::measures;
-use crate::subject::Subject;
+use crate::rows;
+use crate::subject::{Page, Subject};
 use serde_json::{Value, json};
 use std::collections::{BTreeMap, VecDeque};
 use std::io::{self, Read, Write};
 use std::net::{Shutdown, TcpStream};
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 use tungstenite::protocol::frame::coding::CloseCode;
@@ -77,6 +79,9 @@ struct Desk {
 /// One viewer.
 #[derive(Default)]
 pub struct Viewer {
+    guest: bool,
+    /// Its number, once it is known.
+    number: AtomicU64,
     desk: Mutex<Desk>,
     wake: Condvar,
 }
@@ -91,6 +96,16 @@ fn config() -> WebSocketConfig {
 }
 
 impl Viewer {
+    /// A connection that has not shown its key. `guest`: through the link for others.
+    pub fn new(guest: bool) -> Viewer {
+        Viewer { guest, ..Viewer::default() }
+    }
+
+    /// Who it is, once it is known.
+    pub fn page(&self) -> Page {
+        Page { number: self.number.load(Ordering::Relaxed), guest: self.guest }
+    }
+
     fn desk(&self) -> MutexGuard<'_, Desk> {
         self.desk.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -180,7 +195,11 @@ impl Viewer {
 
     fn obey(&self, text: &str, subject: &dyn Subject) {
         let (number, result) = match line::read(text) {
-            Ok(Line::Say(number, words)) => (Some(number), subject.say(words)),
+            Ok(Line::Say(number, words)) if self.guest && line::seen(words).1 != "stop" => {
+                (Some(number), Err("this link is for looking, and for stop: whoever printed it operates".into()))
+            }
+            Ok(Line::Say(number, words)) => (Some(number), subject.say(self.page(), words)),
+            Ok(Line::Here) => return subject.here(self.page()),
             Ok(Line::View(view)) => {
                 let mut desk = self.desk();
                 desk.views.insert(view.id, (view, None));
@@ -200,7 +219,8 @@ impl Viewer {
                     desk.news = true;
                 }
                 drop(desk);
-                return self.wake.notify_one();
+                self.wake.notify_one();
+                return subject.drew(self.page());
             }
             Ok(Line::Between(number, from, to, curves)) => {
                 let measured = curves.iter().map(|curve| {
@@ -211,6 +231,13 @@ impl Viewer {
                 let told = json!({ "kind": "measures", "number": number, "curves": curves, "measures": measured });
                 return self.push(Message::text(told.to_string()));
             }
+            Ok(Line::Csv(number, from, to, curves)) => match rows::rows(subject, from, to, &curves) {
+                Ok(rows) => {
+                    let told = json!({ "kind": "csv", "number": number, "curves": curves, "rows": rows });
+                    return self.push(Message::text(told.to_string()));
+                }
+                Err(why) => (None, Err(why)),
+            },
             Ok(Line::Find(number, Crossing { curve, rises, level, after })) => {
                 let mut points = |each: &mut dyn FnMut(f64, f64) -> bool| subject.points(curve, after, each);
                 let t = measures::crossing(&mut points, rises, level, after);
@@ -260,7 +287,9 @@ impl Viewer {
                 state = None;
                 // Its numbers of signals mean others now: the page asks anew.
                 self.desk().views.clear();
-                let text = json!({ "kind": "hello", "number": number, "is": value }).to_string();
+                let Page { number: page, guest } = self.page();
+                let told = json!({ "kind": "hello", "number": number, "page": page, "guest": guest, "is": value });
+                let text = told.to_string();
                 if socket.send(Message::text(text)).is_err() {
                     break;
                 }
@@ -305,13 +334,20 @@ impl Viewer {
     }
 }
 
+/// All viewers, and the number of the latest.
+#[derive(Default)]
+struct Room {
+    viewers: Mutex<Vec<Arc<Viewer>>>,
+    numbers: AtomicU64,
+}
+
 /// Wakes all viewers.
 #[derive(Clone, Default)]
-pub struct Bell(Arc<Mutex<Vec<Arc<Viewer>>>>);
+pub struct Bell(Arc<Room>);
 
 impl Bell {
     fn all(&self) -> MutexGuard<'_, Vec<Arc<Viewer>>> {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+        self.0.viewers.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// Says that something of the subject may have changed.
@@ -325,10 +361,12 @@ impl Bell {
         self.all().len()
     }
 
+    /// Adds one and gives it its number, if there is room: guests take none from others.
     pub(crate) fn add(&self, viewer: &Arc<Viewer>, most: usize) -> bool {
         let mut all = self.all();
-        let room = all.len() < most;
+        let room = all.iter().filter(|other| other.guest == viewer.guest).count() < most;
         if room {
+            viewer.number.store(self.0.numbers.fetch_add(1, Ordering::Relaxed) + 1, Ordering::Relaxed);
             all.push(viewer.clone());
         }
         room

@@ -24,6 +24,7 @@ mod panel;
 use clap::{Parser, Subcommand, ValueHint};
 use runtime::drive::serve::Doors;
 use runtime::record::parts;
+use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
@@ -136,6 +137,12 @@ struct RunArgs {
     /// Port of the panel on this computer; if it is taken, the next free one
     #[arg(long, value_name = "PORT", requires = "panel", default_value_t = ::panel::server::PORT)]
     port: u16,
+    /// Others may look at the panel at this address of this computer, and stop the rig: they have a link of their own
+    #[arg(long, value_name = "ADDR:PORT", requires = "panel")]
+    share: Option<SocketAddr>,
+    /// Stop the rig if no page of any panel has been drawn for this time, such as 2s; it is armed only once one is
+    #[arg(long, value_name = "TIME", value_parser = dead_man, conflicts_with_all = ["fast", "check"])]
+    dead_man: Option<f64>,
     #[command(flatten)]
     sizes: Sizes,
     #[command(flatten)]
@@ -149,6 +156,9 @@ struct PanelArgs {
     /// Port on this computer; if it is taken, the next free one
     #[arg(long, value_name = "PORT", default_value_t = ::panel::server::PORT)]
     port: u16,
+    /// Others may look at this address of this computer, and stop the rig: they have a link of their own
+    #[arg(long, value_name = "ADDR:PORT")]
+    share: Option<SocketAddr>,
     /// Curves in memory; what is older is left out
     #[arg(long, value_name = "SIZE", value_parser = parts::bytes, default_value = "256MB")]
     keep: u64,
@@ -272,6 +282,12 @@ fn seconds(text: &str) -> Result<f64, String> {
     }
 }
 
+/// The time of a dead man's switch. Logs are written ten times a second, so a picture may be some tenths of a second old.
+fn dead_man(text: &str) -> Result<f64, String> {
+    let time = seconds(text)?;
+    if time >= 0.5 { Ok(time) } else { Err("0.5 s or more is needed: pictures come ten times a second at best".into()) }
+}
+
 fn address(text: &str) -> Result<(String, String), String> {
     let (bus, address) = text.split_once('=').ok_or("write it as BUS=ADDRESS, for example can0=socketcan:can1")?;
     Ok((bus.into(), address.into()))
@@ -334,6 +350,8 @@ fn ran(args: &RunArgs) -> Result<u8, String> {
         log: args.log.as_deref(),
         limits: args.sizes.limits(),
         panel: args.panel.then_some(args.port),
+        share: args.share,
+        dead_man: args.dead_man,
     };
     run::run(&wanted)
 }
@@ -361,12 +379,13 @@ fn main() -> ExitCode {
         Command::Run(run) => return ended(ran(run)),
         Command::Drives(drives) => return ended(served(drives)),
         Command::Panel(args) => {
-            let PanelArgs { port, keep, of_run, store, keys } = args;
+            let PanelArgs { port, share, keep, of_run, store, keys } = args;
             let (dir, trusted) = (&store.dir, &keys.trusted);
             return ended(panel::panel(&panel::PanelArguments {
                 dir,
                 trusted,
                 port: *port,
+                share: *share,
                 keep: *keep,
                 of_run: *of_run,
             }));

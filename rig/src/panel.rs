@@ -23,7 +23,7 @@ use runtime::record::log::{Reader, newest_part};
 use runtime::record::parts;
 use std::fs::File;
 use std::io::{BufRead, BufReader, Read, Write};
-use std::net::Shutdown;
+use std::net::{Shutdown, SocketAddr};
 use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -44,6 +44,8 @@ pub struct PanelArguments<'a> {
     pub trusted: &'a Path,
     /// Port that is tried first.
     pub port: u16,
+    /// Address at which others may look.
+    pub share: Option<SocketAddr>,
     /// Bytes of its curves in memory.
     pub keep: u64,
     /// Whether it is the child of `run --panel`, and waits for it.
@@ -109,8 +111,11 @@ pub fn panel(wanted: &PanelArguments) -> Result<u8, String> {
     let bell = Bell::default();
     let name = package.file_stem().unwrap_or_default().to_string_lossy().into_owned();
     let operated = Arc::new(Operated::new(&name, Box::new(stream), bell.clone()));
-    let open = Panel::open(wanted.port, operated.clone(), bell.clone()).map_err(|why| format!("no panel: {why}"))?;
+    let open = Panel::open(wanted.port, operated.clone(), bell.clone());
+    let open = open.and_then(|open| wanted.share.into_iter().try_fold(open, Panel::shared_at));
+    let open = open.map_err(|why| format!("no panel: {why}"))?;
     words::print(&format!("panel  {}\n", open.link()));
+    open.share_link().iter().for_each(|link| words::print(&format!("share  {link}\n")));
     std::thread::spawn(move || open.serve());
     {
         let (operated, bell) = (operated.clone(), bell.clone());
@@ -124,7 +129,7 @@ pub fn panel(wanted: &PanelArguments) -> Result<u8, String> {
     for line in lines.lines().map_while(Result::ok) {
         operated.told(&line);
     }
-    operated.left("the process of the rig was killed");
+    operated.ended("the process of the rig was killed");
     operated::remain(&bell);
     Ok(0)
 }

@@ -9,7 +9,7 @@ use crate::words;
 use abi::rig::Rig;
 use runtime::can::Bus;
 use runtime::can::sim::Simulation;
-use runtime::hil::cycle::{Command, End, Gauges};
+use runtime::hil::cycle::{Attention, Command, End, Gauges};
 use runtime::hil::live::Judge;
 use runtime::hil::operator::{Answer, Mark, NO_RESET, Operator, Reason, Stamp, Stopper};
 use runtime::hil::session::{self, Drives, Session, Setup};
@@ -20,7 +20,7 @@ use runtime::record::log::{Sections, Settings, Sink};
 use runtime::record::parts::{self, Limits};
 use std::fs;
 use std::io::{BufRead, BufReader, Read, Take, Write};
-use std::net::Shutdown;
+use std::net::{Shutdown, SocketAddr};
 use std::os::unix::net::{UnixListener, UnixStream};
 use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
@@ -59,6 +59,10 @@ pub struct RunArguments<'a> {
     pub limits: Limits,
     /// Port of a panel, which is a process of its own; none: no panel.
     pub panel: Option<u16>,
+    /// Address at which others may look at it.
+    pub share: Option<SocketAddr>,
+    /// Time for which no page of any panel need be drawn, s; none: for ever.
+    pub dead_man: Option<f64>,
 }
 
 /// Result of a run.
@@ -178,10 +182,15 @@ fn once(wanted: &RunArguments, open: &Open, store: &Store, target: &Path, packag
     for lack in watches::missing_monitors(&rig) {
         words::print(&format!("  note: {lack}\n"));
     }
+    let attention = wanted.dead_man.map(|limit| Arc::new(Attention::new(Duration::from_secs_f64(limit))));
+    if let Some(attention) = &attention {
+        session.hil.attended_by(attention.clone());
+    }
     let operator = session.operator().filter(|_| !drives.is_fast());
     let gauges = session.hil.gauges();
-    let attendant =
-        operator.map(|operator| Attendant::new(wanted, store, target, gauges, operator.by_the_wall(), judge, facts));
+    let attendant = operator.map(|operator| {
+        Attendant::new(wanted, store, target, (gauges, attention), operator.by_the_wall(), judge, facts)
+    });
     let end = session.run();
     attendant.iter().for_each(|attendant| attendant.tell_end(&end.words()));
     let replaced = attendant.as_ref().is_some_and(|attendant| attendant.replaced.load(Ordering::Relaxed));
@@ -231,6 +240,9 @@ fn beside(wanted: &RunArguments, port: u16) -> Result<Child, String> {
     let mut command = std::process::Command::new(std::env::current_exe().map_err(about)?);
     command.args(["panel", "--of-run", "--port", &port.to_string(), "--dir"]).arg(wanted.dir);
     command.arg("--trusted").arg(wanted.trusted);
+    if let Some(share) = wanted.share {
+        command.args(["--share", &share.to_string()]);
+    }
     // In a process group of its own: Ctrl-C stops the rig, and the panel shows how it ended.
     command.process_group(0).stdin(Stdio::piped()).spawn().map_err(about)
 }
@@ -249,7 +261,7 @@ impl Attendant {
         wanted: &RunArguments,
         store: &Store,
         target: &Path,
-        gauges: Arc<Gauges>,
+        (gauges, attention): (Arc<Gauges>, Option<Arc<Attention>>),
         operator: Operator,
         judge: Judge,
         facts: Facts,
@@ -258,8 +270,16 @@ impl Attendant {
         let stopper = operator.stopper();
         let (gauges_told, ended, panels) = (gauges.clone(), Mutex::default(), AtomicUsize::new(0));
         let operator = Mutex::new(operator);
-        let desk =
-            Arc::new(Desk { operator, stopper: stopper.clone(), judge, facts, gauges: gauges_told, ended, panels });
+        let desk = Arc::new(Desk {
+            operator,
+            stopper: stopper.clone(),
+            judge,
+            facts,
+            gauges: gauges_told,
+            attention,
+            ended,
+            panels,
+        });
         let dir = wanted.dir.to_path_buf();
         let mut threads = Vec::new();
         {
@@ -351,6 +371,7 @@ struct Desk {
     judge: Judge,
     facts: Facts,
     gauges: Arc<Gauges>,
+    attention: Option<Arc<Attention>>,
     /// How the run ended.
     ended: Mutex<Option<String>>,
     /// Panels that are connected.
@@ -397,8 +418,12 @@ impl Desk {
         if line.trim() == "attend" {
             return self.attend_panel(stream, lines);
         }
-        let said = self.carry_out(line.trim());
-        let _ = (&*stream).write_all(format!("{}\n", said.err().unwrap_or_else(|| "ok".into())).as_bytes());
+        let said = match self.carry_out(line.trim()) {
+            Ok(Some(cycle)) => format!("ok {cycle}\n"),
+            Ok(None) => "ok\n".into(),
+            Err(why) => format!("{why}\n"),
+        };
+        let _ = (&*stream).write_all(said.as_bytes());
     }
 
     /// Serves a panel until the run or the connection ends.
@@ -470,6 +495,10 @@ impl Desk {
             if !lines.read_line(&mut line).is_ok_and(|n| n > 0) {
                 return;
             }
+            if line.trim() == "seen" {
+                self.attention.iter().for_each(|attention| attention.seen());
+                continue;
+            }
             let Some((number, said)) = line.trim().split_once(' ') else { continue };
             let Ok(number) = number.parse::<u64>() else { continue };
             let command = said.strip_prefix('@').and_then(|rest| rest.split_once(' ')).map_or(said, |(_, rest)| rest);
@@ -486,14 +515,16 @@ impl Desk {
     fn answer(&self, to: &Mutex<&UnixStream>, queue: &mpsc::Receiver<(u64, String)>) {
         for (number, said) in queue {
             match self.carry_out(&said) {
-                Ok(()) => tell_panel(to, &format!("ok {number}")),
+                Ok(Some(cycle)) => tell_panel(to, &format!("ok {number} {cycle}")),
+                Ok(None) => tell_panel(to, &format!("ok {number}")),
                 Err(why) => tell_panel(to, &format!("refused {number} {}", why.trim_start_matches("refused: "))),
             };
         }
     }
 
     /// Executes `@NS COMMAND`: a command and the time at which it was given, by the monotonic clock of this computer.
-    fn carry_out(&self, line: &str) -> Result<(), String> {
+    /// Returns the cycle of the log that took it, if one did.
+    fn carry_out(&self, line: &str) -> Result<Option<u64>, String> {
         let stamped = line.strip_prefix('@').and_then(|rest| rest.split_once(' '));
         let (stamp, said) = match stamped.and_then(|(ns, said)| Some((Stamp::Wall(ns.parse().ok()?), said))) {
             Some(both) => both,
@@ -506,7 +537,7 @@ impl Desk {
             // Clients do not wait for each other.
             "stop" => {
                 self.stopper.stop();
-                return Ok(());
+                return Ok(None);
             }
             _ => match said.strip_prefix("set ") {
                 Some(set) => Command::Set(self.judge.read(set)?),
@@ -526,7 +557,7 @@ impl Desk {
             // Other clients can send meanwhile.
             let answer = operator().answer(ticket);
             match answer {
-                Some(Answer::Taken) => return Ok(()),
+                Some(Answer::Taken(cycle)) => return Ok(cycle),
                 Some(Answer::Refused(why)) => return Err(refused(why)),
                 None => std::thread::sleep(Duration::from_millis(2)),
             }
@@ -548,13 +579,19 @@ pub fn say(dir: &Path, what: &str) -> Result<String, String> {
     if BufReader::new(&stream).read_line(&mut line).is_err() || line.trim().is_empty() {
         return Err(format!("the rig in {} did not answer: {what} is not known to act", dir.display()));
     }
-    match line.trim() {
+    let taken = match line.trim() {
+        "ok" => String::new(),
+        line => match line.strip_prefix("ok ") {
+            Some(cycle) => format!("  by cycle {cycle} of the log\n"),
+            None => return Err(line.into()),
+        },
+    };
+    match what.starts_with("set ") {
         // A stability check requires the compiler.
-        "ok" if what.starts_with("set ") => Ok(format!(
-            "{what}\n  not judged: whether the fixed step (E0702) and the contacts are stable with it; `fric predict --set` is\n"
+        true => Ok(format!(
+            "{what}\n{taken}  not judged: whether the fixed step (E0702) and the contacts are stable with it; `fric predict --set` is\n"
         )),
-        "ok" => Ok(format!("{what}\n")),
-        why => Err(why.into()),
+        false => Ok(format!("{what}\n{taken}")),
     }
 }
 

@@ -104,6 +104,8 @@ pub enum Cause {
     Unpredictable,
     /// The cycle did not end in time.
     Watchdog,
+    /// Nobody watches the rig any more (dead man's switch).
+    Unwatched,
 }
 
 /// How a rig stops.
@@ -128,7 +130,8 @@ impl Cause {
             | Cause::NotFollowing(_)
             | Cause::Overload(_)
             | Cause::Energy
-            | Cause::Unpredictable => Reaction::Controlled,
+            | Cause::Unpredictable
+            | Cause::Unwatched => Reaction::Controlled,
             Cause::Speed(..)
             | Cause::Travel(..)
             | Cause::RunAway(_)
@@ -165,6 +168,7 @@ impl Cause {
             Cause::Energy => (17, 0, 0),
             Cause::Watchdog => (18, 0, 0),
             Cause::Unpredictable => (19, 0, 0),
+            Cause::Unwatched => (20, 0, 0),
         };
         [kind << 32 | index as u64, value]
     }
@@ -192,6 +196,7 @@ impl Cause {
             17 => Cause::Energy,
             18 => Cause::Watchdog,
             19 => Cause::Unpredictable,
+            20 => Cause::Unwatched,
             _ => return None,
         })
     }
@@ -1040,6 +1045,8 @@ mod tests {
             Cause::NotFollowing(0),
             Cause::Overload(0),
             Cause::Energy,
+            Cause::Unpredictable,
+            Cause::Unwatched,
         ];
         for cause in quick.iter().chain(&controlled) {
             assert_eq!(Cause::from_words(cause.to_words()), Some(*cause));

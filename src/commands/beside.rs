@@ -5,11 +5,12 @@
 //! commands of its viewers, as lines from its standard output. Its curves it reads from the log by itself. If it dies,
 //! the rig does not notice.
 //!
-//! The lines are those of [`panel::operated`]; its first one is `link URL`.
+//! The lines are those of [`panel::operated`]; its first one is `link URL`, then `share URL` if others may look. After
+//! the end of a run its viewers may ask for the next one.
 
+use crate::args::Hil as Args;
 use crate::terminal::Terminal;
 use runtime::hil::cycle::Gauges;
-use runtime::hil::operator::Stopper;
 use std::io::{BufRead, BufReader, Write};
 use std::os::unix::process::CommandExt;
 use std::path::Path;
@@ -28,15 +29,11 @@ const WAITING: usize = 16;
 pub struct Told(Arc<Mutex<ChildStdin>>);
 
 impl Told {
-    fn say(&self, line: &str) {
+    /// Says a line.
+    pub fn say(&self, line: &str) {
         let clean: String = line.chars().map(|c| if c.is_control() { ' ' } else { c }).collect();
         let mut to = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         let _ = to.write_all(format!("{clean}\n").as_bytes());
-    }
-
-    /// Tells how the run ended.
-    pub fn over(&self, words: &str) {
-        self.say(&format!("over {words}"));
     }
 }
 
@@ -50,10 +47,11 @@ pub struct Asked {
 }
 
 impl Asked {
-    /// Answers it.
-    pub fn answer(self, result: &Result<(), String>) {
+    /// Answers it, with the cycle that took it.
+    pub fn answer(self, result: &Result<Option<u64>, String>) {
         match result {
-            Ok(()) => self.told.say(&format!("ok {}", self.number)),
+            Ok(Some(cycle)) => self.told.say(&format!("ok {} {cycle}", self.number)),
+            Ok(None) => self.told.say(&format!("ok {}", self.number)),
             Err(why) => self.told.say(&format!("refused {} {why}", self.number)),
         }
     }
@@ -65,9 +63,20 @@ impl Drop for Asked {
     }
 }
 
+/// What is done with the lines of the panel.
+pub struct Hear<'a> {
+    /// Stops the rig.
+    pub stop: &'a dyn Fn(),
+    /// Somebody has seen the rig.
+    pub seen: &'a dyn Fn(),
+    /// Carries out another command.
+    pub ask: &'a dyn Fn(Asked),
+}
+
 /// The panel's process.
 pub struct Beside {
-    told: Told,
+    /// Speaks to it.
+    pub told: Told,
     from: ChildStdout,
 }
 
@@ -77,12 +86,15 @@ impl Beside {
     ///
     /// # Errors
     /// Why not, in words.
-    pub fn start(log: &Path, started: &str, port: u16, no_open: bool) -> Result<Beside, String> {
+    pub fn start(log: &Path, started: &str, args: &Args) -> Result<Beside, String> {
         let about = |error: std::io::Error| format!("no panel: {error}");
         let mut command = Command::new(std::env::current_exe().map_err(about)?);
-        command.args(["panel", "--of-rig", started, "--port", &port.to_string()]).arg(log);
-        if no_open {
+        command.args(["panel", "--of-rig", started, "--port", &args.port.to_string()]).arg(log);
+        if args.no_open {
             command.arg("--no-open");
+        }
+        if let Some(share) = args.share {
+            command.args(["--share", &share.to_string()]);
         }
         // In a process group of its own: Ctrl-C stops the rig, and the panel shows how it ended.
         let mut child = command.process_group(0).stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().map_err(about)?;
@@ -90,11 +102,6 @@ impl Beside {
             return Err("no panel: it has no standard input and output".into());
         };
         Ok(Beside { told: Told(Arc::new(Mutex::new(to))), from })
-    }
-
-    /// Speaks to it.
-    pub fn told(&self) -> Told {
-        self.told.clone()
     }
 
     /// Tells the stage of the rig until the run is over: for a thread of its own.
@@ -115,29 +122,33 @@ impl Beside {
         }
     }
 
-    /// Reads what viewers say, until the panel ends: for a thread of its own. `ask` passes a command on.
-    pub fn read(self, stopper: &Stopper, ask: &dyn Fn(Asked)) {
+    /// Reads what viewers say, until the panel ends: for a thread of its own.
+    pub fn read(self, hear: &Hear) {
         let waiting = Arc::new(AtomicUsize::new(0));
         let mut terminal = Terminal::new();
         for line in BufReader::new(self.from).lines() {
             let Ok(line) = line else { break };
+            if line == "seen" {
+                (hear.seen)();
+                continue;
+            }
             let Some((first, rest)) = line.split_once(' ') else { continue };
-            if first == "link" {
-                terminal.line(&format!("panel  {rest}"));
+            if let "link" | "share" = first {
+                terminal.line(&format!("{}  {rest}", if first == "link" { "panel" } else { first }));
                 continue;
             }
             let Ok(number) = first.parse() else { continue };
             if rest == "stop" {
-                stopper.stop();
+                (hear.stop)();
                 self.told.say(&format!("ok {number}"));
             } else if waiting.fetch_add(1, Ordering::Relaxed) >= WAITING {
                 waiting.fetch_sub(1, Ordering::Relaxed);
                 self.told.say(&format!("refused {number} {WAITING} commands wait already: say it again"));
             } else {
                 let (text, told, waiting) = (rest.to_string(), self.told.clone(), waiting.clone());
-                ask(Asked { text, number, told, waiting });
+                (hear.ask)(Asked { text, number, told, waiting });
             }
         }
-        terminal.error("the panel has ended; the rig runs on, and this prompt commands it");
+        terminal.error("the panel has ended; a rig that runs does so on, and this prompt commands it");
     }
 }

@@ -1,7 +1,8 @@
 //! `fric hil`: runs a rig with drives on its buses, real or simulated.
 
 use super::beside::Beside;
-use super::prompt::{Rehearsal, prompt};
+use super::company::Company;
+use super::prompt::Rehearsal;
 use super::{End, chosen_rig, load_from};
 use crate::args::Hil as Args;
 use crate::compile::{self, CompiledRig, Options, Stopwatch};
@@ -33,6 +34,17 @@ use std::time::Duration;
 const BLACK_BOX_NS: u64 = 10_000_000_000;
 
 pub fn hil(args: &Args, terminal: &mut Terminal) -> End {
+    let mut company = Company::new(args);
+    loop {
+        let end = once(args, &mut company, terminal);
+        if !company.wish_for_another(terminal) {
+            return end;
+        }
+    }
+}
+
+/// One run, from the texts as they are now.
+fn once(args: &Args, company: &mut Company, terminal: &mut Terminal) -> End {
     let keeping = Keeping::new(&crate::disk::Disk);
     let mut watch = Stopwatch::start("read");
     let Some(mut loaded) = load_from(&args.file, &keeping, terminal, &mut watch) else { return End::Failed };
@@ -76,9 +88,9 @@ pub fn hil(args: &Args, terminal: &mut Terminal) -> End {
         .with("set", set.join("\n"))
         .with("started", session::started(drives));
     let head = keeping.into(head);
-    let log = Some((log_settings(args, &name, &ready, drives), head.clone()));
+    let log = Some((log_settings(args, &name, &ready, (drives, company)), head.clone()));
     if args.identify {
-        return identified(args, ready, drives, terminal);
+        return identified(args, ready, drives, company, terminal);
     }
     let Some(needs_look) = bearable(args, &ready, terminal) else { return End::Failed };
     ready.rig.needs_look = needs_look;
@@ -95,7 +107,7 @@ pub fn hil(args: &Args, terminal: &mut Terminal) -> End {
         needs_look,
     };
     let asked = Asked { log, rehearsal: Some(rehearsal), ..Asked::default() };
-    with_buses(args, ready, drives, asked, terminal)
+    with_buses(args, ready, drives, (asked, company), terminal)
 }
 
 /// Whether the rig is stable only with the predictor; none if it must not run.
@@ -151,8 +163,9 @@ fn daring(args: &Args) -> Option<&'static str> {
     all.into_iter().find(|(given, _)| *given).map(|(_, name)| name)
 }
 
-fn log_settings(args: &Args, name: &str, ready: &CompiledRig, drives: Drives) -> Settings {
+fn log_settings(args: &Args, name: &str, ready: &CompiledRig, (drives, company): (Drives, &Company)) -> Settings {
     let path = args.log.clone().unwrap_or_else(|| PathBuf::from("out").join(format!("{name}.friclog")));
+    let path = company.log(path);
     let sink = if args.no_log {
         let path = PathBuf::from("out").join(format!("{name}.blackbox.friclog"));
         Sink::BlackBox(path, session::blocks(BLACK_BOX_NS))
@@ -184,7 +197,13 @@ fn hil_options(args: &Args, ready: &CompiledRig, drives: Drives) -> Result<HilOp
 }
 
 /// Runs torque pulses in place of the model.
-fn identified(args: &Args, mut ready: CompiledRig, drives: Drives, terminal: &mut Terminal) -> End {
+fn identified(
+    args: &Args,
+    mut ready: CompiledRig,
+    drives: Drives,
+    company: &mut Company,
+    terminal: &mut Terminal,
+) -> End {
     let asked = match Identification::new(&ready.rig) {
         Ok(asked) => asked,
         Err(why) => {
@@ -196,7 +215,7 @@ fn identified(args: &Args, mut ready: CompiledRig, drives: Drives, terminal: &mu
     ready.rig = asked.rig.clone();
     ready.control = asked.program.clone();
     let asked = Asked { pulses: Some(&asked), ..Asked::default() };
-    with_buses(args, ready, drives, asked, terminal)
+    with_buses(args, ready, drives, (asked, company), terminal)
 }
 
 /// Prints the measured parameters as text to paste.
@@ -226,8 +245,11 @@ struct Asked<'a> {
     rehearsal: Option<Rehearsal>,
 }
 
+/// What is asked of a run, and by whom.
+type AskedBy<'a, 'b> = (Asked<'a>, &'b mut Company);
+
 /// Runs with the buses of these drives.
-fn with_buses(args: &Args, ready: CompiledRig, drives: Drives, asked: Asked, terminal: &mut Terminal) -> End {
+fn with_buses(args: &Args, ready: CompiledRig, drives: Drives, asked: AskedBy, terminal: &mut Terminal) -> End {
     match drives {
         Drives::Simulated(pace) => in_process(args, ready, pace, asked, terminal),
         Drives::Real => on_buses(args, ready, asked, terminal),
@@ -235,7 +257,7 @@ fn with_buses(args: &Args, ready: CompiledRig, drives: Drives, asked: Asked, ter
 }
 
 /// Runs with buses, drives and devices in this process.
-fn in_process(args: &Args, ready: CompiledRig, pace: Pace, asked: Asked, terminal: &mut Terminal) -> End {
+fn in_process(args: &Args, ready: CompiledRig, pace: Pace, asked: AskedBy, terminal: &mut Terminal) -> End {
     let world = World::new(&ready.rig, Some(ready.plant.clone()), pace, args.seed);
     let mut world = match world {
         Ok(world) => world,
@@ -258,7 +280,7 @@ fn in_process(args: &Args, ready: CompiledRig, pace: Pace, asked: Asked, termina
 }
 
 /// Runs on the buses of this machine.
-fn on_buses(args: &Args, ready: CompiledRig, asked: Asked, terminal: &mut Terminal) -> End {
+fn on_buses(args: &Args, ready: CompiledRig, asked: AskedBy, terminal: &mut Terminal) -> End {
     let world = Simulation::real_time();
     match session::buses(&ready.rig, &world) {
         Ok(buses) => run(args, ready, Box::new(world), buses, (Drives::Real, None), asked, terminal),
@@ -276,7 +298,7 @@ fn run(
     clock: Box<dyn Clock>,
     buses: Vec<Box<dyn Bus>>,
     (drives, simulated): (Drives, Option<&World>),
-    asked: Asked,
+    (asked, company): AskedBy,
     terminal: &mut Terminal,
 ) -> End {
     let Asked { log, pulses: asked, rehearsal } = asked;
@@ -284,20 +306,12 @@ fn run(
         Sink::File(path, _) | Sink::BlackBox(path, _) => path.clone(),
     });
     // Before the calling thread is set up for real time.
-    let beside = match (args.panel, &log, &log_path) {
-        (true, Some((_, head)), Some(path)) => {
-            let started = head.text("started").unwrap_or_default();
-            match Beside::start(path, started, args.port, args.no_open) {
-                Ok(beside) => Some(beside),
-                Err(why) => {
-                    terminal.error(&why);
-                    return End::Failed;
-                }
-            }
-        }
-        _ => None,
-    };
-    let told = beside.as_ref().map(Beside::told);
+    if let (true, Some((_, head)), Some(path)) = (args.panel, &log, &log_path)
+        && let Err(why) = company.shows(path, head.text("started").unwrap_or_default(), args)
+    {
+        terminal.error(&why);
+        return End::Failed;
+    }
     let started = hil_options(args, &ready, drives).and_then(|mut options| {
         if let Some(asked) = asked {
             options.duration_ns = Some(asked.duration_ns);
@@ -318,11 +332,14 @@ fn run(
     let mut session = match started {
         Ok(session) => session,
         Err(why) => {
-            told.iter().for_each(|told| told.over(&why));
+            company.ends(&why);
             terminal.error(&why);
             return End::Failed;
         }
     };
+    if let Some(attention) = &company.attention {
+        session.hil.attended_by(attention.clone());
+    }
     let rig = &ready.rig;
     if !args.quiet {
         begin(rig, drives, session.refused(), &ready.notes, terminal);
@@ -333,12 +350,12 @@ fn run(
         let (gauges, rig, over) = (session.hil.gauges(), rig.clone(), over.clone());
         std::thread::spawn(move || view(&gauges, &rig, &over))
     });
-    let telling = told.clone().map(|told| {
+    let telling = company.told().map(|told| {
         let (gauges, over) = (session.hil.gauges(), over.clone());
         std::thread::spawn(move || Beside::tell(&told, &gauges, &over))
     });
     if let Some(operator) = session.operator().filter(|_| !drives.is_fast()) {
-        std::thread::spawn(move || prompt(operator.by_the_wall(), rehearsal, beside));
+        company.begins(operator.by_the_wall(), rehearsal);
     }
     if let Some(asked) = asked {
         let rows = identify::rows(&mut session.hil, asked);
@@ -362,9 +379,7 @@ fn run(
         checked(rig, &session.hil, terminal);
     }
     let finished = session.finish();
-    if let Some(told) = told {
-        told.over(&end.words());
-    }
+    company.ends(&end.words());
     finish(args, finished, end, log_path, terminal)
 }
 

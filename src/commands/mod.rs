@@ -22,6 +22,8 @@ mod beside;
 #[cfg(all(feature = "hardware", target_os = "linux"))]
 mod prompt;
 #[cfg(all(feature = "hardware", target_os = "linux"))]
+mod company;
+#[cfg(all(feature = "hardware", target_os = "linux"))]
 mod hil;
 mod inspect;
 mod key;

@@ -81,7 +81,7 @@ pub fn panel(args: &Args, terminal: &mut Terminal) -> End {
     };
     match &args.save {
         Some(path) => save(path, &shown, terminal),
-        None => serve(args, &shown, bell, terminal),
+        None => serve(args, &shown, &bell, terminal),
     }
 }
 
@@ -125,15 +125,12 @@ fn operate(
     words: &str,
     terminal: &mut Terminal,
 ) -> Result<Option<tempfile::NamedTempFile>, End> {
-    let open = match Panel::open(args.port, operated.clone(), bell.clone()) {
-        Ok(open) => open,
-        Err(why) => {
-            terminal.error(&format!("no panel: {why}"));
-            return Err(End::Failed);
-        }
-    };
+    let open = opened(args, operated.clone(), bell, terminal).ok_or(End::Failed)?;
     let link = open.link();
     terminal.line(&format!("{words}{link}"));
+    open.share_link()
+        .iter()
+        .for_each(|link| terminal.line(&format!("{}{link}", words.replace("panel", "share").replace("link", "share"))));
     let door = (!args.no_open).then(|| show(&link)).flatten();
     std::thread::spawn(move || open.serve());
     Ok(door)
@@ -161,24 +158,31 @@ fn of_rig(args: &Args, started: &str, bell: &Bell, terminal: &mut Terminal) -> E
         Ok(door) => door,
         Err(end) => return end,
     };
-    {
-        let (operated, file, bell) = (operated.clone(), args.file.clone(), bell.clone());
-        let (started, interpret, keep) = (started.to_string(), args.interpret, args.keep);
+    let follow = |file: PathBuf, started: &str| {
+        let (operated, bell, started, run) = (operated.clone(), bell.clone(), started.to_string(), operated.run());
+        let (interpret, keep) = (args.interpret, args.keep);
         std::thread::spawn(move || {
             while !follow::is_of(&file, &started) {
-                if operated.is_over() {
+                if operated.is_over() || operated.run() != run {
                     return;
                 }
                 std::thread::sleep(LOOK);
             }
             show_log(&operated, &file, interpret, keep, &bell, &|| is_claimed(&file));
         });
-    }
+    };
+    let mut file = args.file.clone();
+    follow(file.clone(), started);
     for line in std::io::stdin().lock().lines() {
         let Ok(line) = line else { break };
-        operated.told(&line);
+        // A run after the first one has another log.
+        match line.split_once(' ') {
+            Some(("log", path)) => file = path.into(),
+            Some(("started", started)) => follow(file.clone(), started),
+            _ => operated.told(&line),
+        }
     }
-    operated.left("the process of the rig was killed");
+    operated.ended("the process of the rig was killed");
     operated::remain(bell);
     End::Fine
 }
@@ -223,7 +227,7 @@ fn of_host(args: &Args, host: &str, bell: &Bell, terminal: &mut Terminal) -> End
     if let Err(why) = &ended {
         operated.told(&format!("problem {why}"));
     }
-    operated.left(&format!(
+    operated.ended(&format!(
         "the connection to {host} has ended; the rig may run on, and only the wired stop reaches it from here"
     ));
     let _ = following.join();
@@ -251,14 +255,20 @@ fn save(path: &Path, shown: &Content, terminal: &mut Terminal) -> End {
     }
 }
 
-fn serve(args: &Args, shown: &Content, bell: Bell, terminal: &mut Terminal) -> End {
-    let open = match Panel::open(args.port, shown.subject(), bell) {
-        Ok(open) => open,
+/// A panel at its port, and at the address for others.
+fn opened(args: &Args, subject: Arc<dyn Subject>, bell: &Bell, terminal: &mut Terminal) -> Option<Panel> {
+    let open = Panel::open(args.port, subject, bell.clone());
+    match open.and_then(|open| args.share.into_iter().try_fold(open, Panel::shared_at)) {
+        Ok(open) => Some(open),
         Err(why) => {
             terminal.error(&format!("no panel: {why}"));
-            return End::Failed;
+            None
         }
-    };
+    }
+}
+
+fn serve(args: &Args, shown: &Content, bell: &Bell, terminal: &mut Terminal) -> End {
+    let Some(open) = opened(args, shown.subject(), bell, terminal) else { return End::Failed };
     let link = open.link();
     let (send, ended) = mpsc::channel();
     let interrupted = send.clone();
@@ -266,6 +276,7 @@ fn serve(args: &Args, shown: &Content, bell: Bell, terminal: &mut Terminal) -> E
         let _ = interrupted.send(None);
     });
     terminal.line(&format!("panel  {link}"));
+    open.share_link().iter().for_each(|link| terminal.line(&format!("share  {link}")));
     let _door = (!args.no_open).then(|| show(&link)).flatten();
     std::thread::spawn(move || {
         let _ = send.send(open.serve().err());

@@ -1,9 +1,10 @@
-//! The operator's prompt of `fric hil`: one thread reads, another executes.
+//! The operator's prompt of `fric hil`: threads that read, and one that executes.
 //!
-//! In: lines. Out: commands, and the result of each. The reading thread sends `stop` itself, so a stop never waits for
-//! a set of parameters that is being validated.
+//! In: lines, typed or from pages of a panel. Out: commands, and the result of each. The threads that read send `stop`
+//! themselves, so a stop never waits for a set of parameters that is being validated. They outlive a run: after its end
+//! people may ask for the next one.
 
-use super::beside::{Asked, Beside};
+use super::beside::Asked;
 use crate::compile::{self, Changes, Loaded, Options};
 use crate::loop_stability;
 use crate::source_snapshot::Kept;
@@ -13,10 +14,11 @@ use abi::format::quantity;
 use abi::live::{Param, Tunable};
 use grammar::diagnostic::Diagnostic;
 use runtime::hil::live::{Judge, Set};
-use runtime::hil::operator::{Answer, Command, Mark, NO_RESET, Operator, Reason};
+use runtime::hil::operator::{Answer, Command, Mark, NO_RESET, Operator, Reason, Stopper};
 use runtime::record::log::Sections;
 use std::io::BufRead;
-use std::sync::mpsc::{Receiver, channel};
+use std::sync::mpsc::{Receiver, Sender, channel};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 /// The commands of a running rig.
 const HELP: &str = "enable, arm: as the drives ask for it; set PATH = VALUE, …: parameters, judged as at a start; \
@@ -103,16 +105,16 @@ impl Rehearsal {
         }
     }
 
-    /// Sends a set to the cycle if a start would accept it. Returns what has changed, in words.
-    fn change(&mut self, operator: &mut Operator, text: &str) -> Result<String, String> {
+    /// Sends a set to the cycle if a start would accept it. Returns what has changed, in words, and the cycle.
+    fn change(&mut self, operator: &mut Operator, text: &str) -> Result<Done, String> {
         let set = self.judge.read(text)?;
         let all = self.with(text);
         self.judge(&set, &all)?;
-        match operator.wait(Command::Set(set)) {
-            Answer::Taken => {}
+        let cycle = match operator.wait(Command::Set(set)) {
+            Answer::Taken(cycle) => cycle,
             Answer::Refused(Reason::Set(objection)) => return Err(self.judge.words(&objection)),
             Answer::Refused(why) => return Err(why.words()),
-        }
+        };
         let mut said = Vec::new();
         for (slot, value) in set.values() {
             let live = self.judge.live().params.iter();
@@ -124,8 +126,17 @@ impl Rehearsal {
             }
         }
         self.set = all;
-        Ok(said.join(", "))
+        Ok(Done { words: said.join(", "), cycle })
     }
+}
+
+/// A command that was carried out.
+#[derive(Default)]
+struct Done {
+    /// What has changed; empty if the command says it all.
+    words: String,
+    /// The cycle of the log that took it.
+    cycle: Option<u64>,
 }
 
 /// A command: typed here, or by a viewer of the panel.
@@ -134,31 +145,117 @@ enum Line {
     Asked(Asked),
 }
 
-/// Reads the operator's input line by line, and the commands from the panel beside it. Without a rehearsal, no parameter
-/// may change.
-pub fn prompt(operator: Operator, rehearsal: Option<Rehearsal>, beside: Option<Beside>) {
-    let stopper = operator.stopper();
-    let (lines, typed) = channel::<Line>();
-    if let Some(beside) = beside {
-        let (lines, stopper) = (lines.clone(), stopper.clone());
-        std::thread::spawn(move || {
-            beside.read(&stopper, &|asked| {
-                let _ = lines.send(Line::Asked(asked));
-            });
-        });
+/// What people want after the end of a run.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub enum Wish {
+    /// The next run.
+    Again,
+    /// The end of the program.
+    Quit,
+}
+
+/// The run that is under way.
+struct Run {
+    stopper: Stopper,
+    lines: Sender<Line>,
+}
+
+/// The run that is under way, if any, and a stop that was said before the next one could hear it.
+#[derive(Default)]
+struct Under {
+    run: Option<Run>,
+    stopped: bool,
+}
+
+/// Passes the lines of all who speak to the run that is under way.
+#[derive(Clone)]
+pub struct Desk {
+    under: Arc<Mutex<Under>>,
+    wishes: Sender<Wish>,
+}
+
+impl Desk {
+    /// Without a run, and what is wished for when there is none.
+    pub fn new() -> (Desk, Receiver<Wish>) {
+        let (wishes, wished) = channel();
+        (Desk { under: Arc::default(), wishes }, wished)
     }
-    let carrying = std::thread::spawn(move || carry_out(operator, rehearsal, &typed));
-    for line in std::io::stdin().lock().lines() {
-        let Ok(line) = line else { break };
-        match line.trim() {
-            "" => {}
-            "stop" | "quit" => stopper.stop(),
-            line if lines.send(Line::Typed(line.into())).is_err() => break,
-            _ => {}
+
+    fn under(&self) -> MutexGuard<'_, Under> {
+        self.under.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// A run begins. Without a rehearsal, no parameter may change.
+    pub fn begins(&self, operator: Operator, rehearsal: Option<Rehearsal>) {
+        let (lines, typed) = channel();
+        let stopper = operator.stopper();
+        std::thread::spawn(move || carry_out(operator, rehearsal, &typed));
+        let mut under = self.under();
+        if std::mem::take(&mut under.stopped) {
+            stopper.stop();
+        }
+        under.run = Some(Run { stopper, lines });
+    }
+
+    /// It has ended.
+    pub fn ends(&self) {
+        *self.under() = Under::default();
+    }
+
+    /// Says what is wished for, for which the program waits after the end of a run.
+    pub fn wish(&self, wish: Wish) {
+        let _ = self.wishes.send(wish);
+    }
+
+    /// Stops the run; the next one, if it is about to begin.
+    pub fn stop(&self) {
+        let mut under = self.under();
+        match &under.run {
+            Some(run) => run.stopper.stop(),
+            None => under.stopped = true,
         }
     }
-    drop(lines);
-    let _ = carrying.join();
+
+    /// A command of a viewer of the panel.
+    pub fn ask(&self, asked: Asked) {
+        let under = self.under();
+        match &under.run {
+            Some(run) => {
+                let _ = run.lines.send(Line::Asked(asked));
+            }
+            None => {
+                drop(under);
+                match asked.text.as_str() {
+                    "again" => {
+                        self.wish(Wish::Again);
+                        asked.answer(&Ok(None));
+                    }
+                    _ => asked.answer(&Err(Reason::Ended.words())),
+                }
+            }
+        }
+    }
+
+    /// Reads what is typed, until that ends: for a thread of its own.
+    pub fn listen(&self) {
+        for line in std::io::stdin().lock().lines() {
+            let Ok(line) = line else { break };
+            let line = line.trim();
+            let under = self.under();
+            match (&under.run, line) {
+                (_, "") => {}
+                (Some(run), "stop" | "quit") => run.stopper.stop(),
+                (Some(run), line) => {
+                    let _ = run.lines.send(Line::Typed(line.into()));
+                }
+                (None, "again") => self.wish(Wish::Again),
+                (None, "stop" | "quit") => self.wish(Wish::Quit),
+                (None, line) => {
+                    Terminal::new().error(&format!("`{line}` is refused: no rig runs. Type again or quit"));
+                }
+            }
+        }
+    }
 }
 
 /// Executes lines in order, and reports the result of each.
@@ -170,9 +267,10 @@ fn carry_out(mut operator: Operator, mut rehearsal: Option<Rehearsal>, typed: &R
             Line::Asked(asked) => &asked.text,
         };
         let mut wait = |command| match operator.wait(command) {
-            Answer::Taken => Ok(String::new()),
+            Answer::Taken(cycle) => Ok(Done { words: String::new(), cycle }),
             Answer::Refused(why) => Err(why.words()),
         };
+        let only = |words: String| Ok(Done { words, cycle: None });
         let done = match (text.as_str(), text.strip_prefix("set "), &mut rehearsal) {
             ("enable", ..) => wait(Command::Enable),
             ("arm", ..) => wait(Command::Arm),
@@ -180,21 +278,26 @@ fn carry_out(mut operator: Operator, mut rehearsal: Option<Rehearsal>, typed: &R
                 Mark::new(&text[4..]).and_then(|mark| wait(Command::Mark(mark)))
             }
             ("reset", ..) => Err(NO_RESET.into()),
-            ("help", ..) => Ok(HELP.into()),
-            ("show", _, Some(rehearsal)) => Ok(rehearsal.shown()),
+            ("again", ..) => Err("the rig runs: stop it first".into()),
+            ("help", ..) => only(HELP.into()),
+            ("show", _, Some(rehearsal)) => only(rehearsal.shown()),
             (_, Some(set), Some(rehearsal)) => rehearsal.change(&mut operator, set),
             (_, Some(_), None) => Err(Reason::Unjudged.words()),
             (_, None, _) => Err("type enable, arm, set PATH = VALUE, mark WORDS, show, help or stop".into()),
         };
         match (&done, &line) {
-            (Ok(said), Line::Typed(_)) if said.is_empty() => {}
-            (Ok(said), Line::Typed(_)) => terminal.line(&format!("  {}", said.trim())),
-            (Ok(said), Line::Asked(asked)) if said.is_empty() => terminal.line(&format!("  panel: {}", asked.text)),
-            (Ok(said), Line::Asked(asked)) => terminal.line(&format!("  panel: {} ({})", asked.text, said.trim())),
+            (Ok(done), Line::Typed(_)) if done.words.is_empty() => {}
+            (Ok(done), Line::Typed(_)) => terminal.line(&format!("  {}", done.words.trim())),
+            (Ok(done), Line::Asked(asked)) if done.words.is_empty() => {
+                terminal.line(&format!("  panel: {}", asked.text))
+            }
+            (Ok(done), Line::Asked(asked)) => {
+                terminal.line(&format!("  panel: {} ({})", asked.text, done.words.trim()))
+            }
             (Err(why), _) => terminal.error(&format!("`{text}` is refused: {why}")),
         }
         if let Line::Asked(asked) = line {
-            asked.answer(&done.map(|_| ()));
+            asked.answer(&done.map(|done| done.cycle));
         }
     }
 }

@@ -163,7 +163,7 @@ impl Exports {
         let cycle = (message.kind == trace::CYCLE).then(|| Cycle::read(self.shape, &message.words)).flatten();
         let Some(cycle) = cycle else { return Vec::new() };
         let when = match time {
-            Some(time) => format!("at {} of the model", quantity::duration(time, 4)),
+            Some(time) => format!("in cycle {}, at {} of the model", cycle.k, quantity::duration(time, 4)),
             None => format!("in cycle {}, when the model did not run", cycle.k),
         };
         let words = |(slot, si): &(Slot, f64)| {

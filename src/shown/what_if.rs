@@ -15,7 +15,7 @@ use panel::knob::Knob;
 use panel::line::View;
 use panel::server::Bell;
 use panel::sheet::{Sheet, Signal};
-use panel::subject::Subject;
+use panel::subject::{Page, Subject};
 use panel::thin;
 use panel::words::clean;
 use runtime::engine::sweep::{self, Case};
@@ -623,7 +623,7 @@ impl Subject for WhatIf {
         }
     }
 
-    fn say(&self, words: &str) -> Result<String, String> {
+    fn say(&self, _: Page, words: &str) -> Result<String, String> {
         let (word, rest) = words.split_once(' ').map_or((words, ""), |(word, rest)| (word, rest.trim()));
         let mut inner = self.inner();
         let letter = |letter: &str| KEPT.iter().find(|(name, _)| *name == letter).map(|(_, layer)| *layer);

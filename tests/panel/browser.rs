@@ -1,5 +1,5 @@
 //! A headless Chromium from Debian's packages, spoken to through two pipes: messages are JSON, each ended by a zero
-//! byte. One browser for all tests, a page for each.
+//! byte. One browser for all tests but those that kill theirs, a page for each.
 
 use crate::debian;
 use ct_codecs::{Base64, Decoder};
@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::mpsc::{Receiver, Sender, channel};
-use std::sync::{Mutex, OnceLock};
+use std::sync::{Arc, Mutex, OnceLock};
 use std::time::{Duration, Instant};
 
 /// Time for anything that a browser does, on a busy machine.
@@ -20,9 +20,15 @@ const PATIENCE: Duration = Duration::from_secs(60);
 pub struct Browser {
     to: Mutex<File>,
     next: AtomicU64,
+    heard: Arc<Heard>,
+    child: Mutex<Child>,
+}
+
+/// What a browser has said.
+#[derive(Default)]
+struct Heard {
     waiting: Mutex<HashMap<u64, Sender<Value>>>,
     events: Mutex<HashMap<String, Vec<Value>>>,
-    _child: Child,
 }
 
 /// A folder with every library of the packages, for LD_LIBRARY_PATH.
@@ -40,8 +46,16 @@ fn libraries(folder: &Path, found: &mut Vec<PathBuf>) {
     }
 }
 
-/// A folder for this run. Those of runs that have ended go.
+/// A folder for a browser of this run. Those of runs that have ended go.
 fn own_folder() -> PathBuf {
+    static ALL: OnceLock<PathBuf> = OnceLock::new();
+    static NUMBER: AtomicU64 = AtomicU64::new(0);
+    let own = ALL.get_or_init(folder_of_run).join(NUMBER.fetch_add(1, Ordering::Relaxed).to_string());
+    fs::create_dir_all(&own).expect("a temporary folder");
+    own
+}
+
+fn folder_of_run() -> PathBuf {
     let all = std::env::temp_dir();
     for entry in fs::read_dir(&all).expect("a temporary folder").flatten() {
         let name = entry.file_name().to_string_lossy().into_owned();
@@ -56,7 +70,8 @@ fn own_folder() -> PathBuf {
     own
 }
 
-fn start() -> Browser {
+/// A browser of its own.
+pub fn start() -> Browser {
     const WANTED: &str = "the page of the panel is tested in Chromium";
     let (program, paths) = match debian::on_path("chromium-headless-shell") {
         Some(program) => (program, Vec::new()),
@@ -88,6 +103,8 @@ fn start() -> Browser {
     // In the order in which the shell opens them. It ends when its pipe ends, with this process.
     let to = fs::OpenOptions::new().write(true).open(to).expect("the pipe opens");
     let mut from = File::open(from).expect("the pipe opens");
+    let heard = Arc::new(Heard::default());
+    let hears = heard.clone();
     std::thread::spawn(move || {
         let (mut bytes, mut piece) = (Vec::new(), vec![0; 1 << 16]);
         while let Ok(n) = from.read(&mut piece) {
@@ -98,12 +115,11 @@ fn start() -> Browser {
             while let Some(end) = bytes.iter().position(|byte| *byte == 0) {
                 let message: Vec<u8> = bytes.drain(..=end).collect();
                 let message: Value = serde_json::from_slice(&message[..end]).expect("JSON");
-                browser().take(message);
+                hears.take(message);
             }
         }
     });
-    let (waiting, events) = (Mutex::default(), Mutex::default());
-    Browser { to: Mutex::new(to), next: AtomicU64::new(1), waiting, events, _child: child }
+    Browser { to: Mutex::new(to), next: AtomicU64::new(1), heard, child: Mutex::new(child) }
 }
 
 pub fn browser() -> &'static Browser {
@@ -111,7 +127,7 @@ pub fn browser() -> &'static Browser {
     ONE.get_or_init(start)
 }
 
-impl Browser {
+impl Heard {
     fn take(&self, message: Value) {
         if let Some(id) = message["id"].as_u64() {
             if let Some(waiting) = self.waiting.lock().unwrap().remove(&id) {
@@ -121,11 +137,19 @@ impl Browser {
             self.events.lock().unwrap().entry(session.into()).or_default().push(message);
         }
     }
+}
+
+impl Browser {
+    /// Kills it.
+    pub fn kill(&self) {
+        let mut child = self.child.lock().unwrap();
+        child.kill().and_then(|()| child.wait()).expect("it is ours");
+    }
 
     fn call(&self, session: Option<&str>, method: &str, params: Value) -> Value {
         let id = self.next.fetch_add(1, Ordering::Relaxed);
         let (sender, receiver): (_, Receiver<Value>) = channel();
-        self.waiting.lock().unwrap().insert(id, sender);
+        self.heard.waiting.lock().unwrap().insert(id, sender);
         let mut message = json!({ "id": id, "method": method, "params": params });
         if let Some(session) = session {
             message["sessionId"] = json!(session);
@@ -144,7 +168,7 @@ impl Browser {
         let blank = json!({ "url": "about:blank", "browserContextId": context, "width": 1400, "height": 900 });
         let target = self.call(None, "Target.createTarget", blank)["targetId"].as_str().expect("an id").to_string();
         let attached = self.call(None, "Target.attachToTarget", json!({ "targetId": target, "flatten": true }));
-        let page = Page { target, session: attached["sessionId"].as_str().expect("an id").into() };
+        let page = Page { browser: self, target, session: attached["sessionId"].as_str().expect("an id").into() };
         for domain in ["Page", "Runtime", "Network", "Log", "DOM", "Accessibility"] {
             page.call(&format!("{domain}.enable"), json!({}));
         }
@@ -155,6 +179,7 @@ impl Browser {
 }
 
 pub struct Page {
+    browser: &'static Browser,
     target: String,
     session: String,
 }
@@ -162,14 +187,14 @@ pub struct Page {
 impl Drop for Page {
     fn drop(&mut self) {
         if !std::thread::panicking() {
-            browser().call(None, "Target.closeTarget", json!({ "targetId": self.target }));
+            self.browser.call(None, "Target.closeTarget", json!({ "targetId": self.target }));
         }
     }
 }
 
 impl Page {
     pub fn call(&self, method: &str, params: Value) -> Value {
-        browser().call(Some(&self.session), method, params)
+        self.browser.call(Some(&self.session), method, params)
     }
 
     pub fn go(&self, url: &str) {
@@ -231,7 +256,7 @@ impl Page {
     }
 
     fn events(&self, method: &str) -> Vec<Value> {
-        let events = browser().events.lock().unwrap();
+        let events = self.browser.heard.events.lock().unwrap();
         let own = events.get(&self.session).into_iter().flatten();
         own.filter(|event| event["method"] == method).map(|event| event["params"].clone()).collect()
     }

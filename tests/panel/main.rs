@@ -3,6 +3,7 @@
 //! Pictures of what was seen are left in `target/panel/`.
 
 mod browser;
+mod client;
 #[path = "../support/debian.rs"]
 mod debian;
 mod hostile;
@@ -48,6 +49,11 @@ impl Panel {
     /// `http://127.0.0.1:PORT`
     fn origin(&self) -> &str {
         self.link.split_once("/#").expect("a link has a key").0
+    }
+
+    /// `127.0.0.1:PORT`
+    fn address(&self) -> &str {
+        self.origin().trim_start_matches("http://")
     }
 
     fn port(&self) -> u16 {

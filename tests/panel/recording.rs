@@ -55,6 +55,26 @@ fn a_recording_is_looked_through() {
     for wanted in [extremes.0, extremes.1, rows.last().unwrap().1] {
         assert!(words.iter().any(|word| (word - wanted).abs() <= 1e-3 * wanted.abs().max(1e-6)), "{wanted} in {told}");
     }
+    // The model, anew from each full state, is near the rig; alone from arming on it is further away. Mutants tried: the
+    // plant at its own start; the state of the second before; the readings of the next cycle.
+    page.wait("!document.getElementById('free').hidden");
+    let differs = |page: &Page| -> f64 {
+        let told = page.text(
+            "[...document.querySelectorAll('.names li')].find(li => li.textContent.startsWith(' body.x') || li.textContent.startsWith('body.x')).querySelector('small').textContent",
+        );
+        number(told.trim().trim_start_matches("(differs by ").trim_end_matches(" rms)"))
+    };
+    page.wait("document.querySelector('.names small').textContent !== ''");
+    let anew = differs(&page);
+    assert!(anew < 0.05, "{anew} deg");
+    page.value("document.getElementById('free').click()");
+    page.wait("document.getElementById('legend').textContent.includes('from arming on')");
+    page.wait("new Promise(done => requestAnimationFrame(() => setTimeout(() => done(true), 300)))");
+    let free = differs(&page);
+    println!("body.x differs by {anew} deg from the model anew each second, by {free} from that from arming on");
+    assert!(free > anew, "{free} {anew}");
+    page.shot("recording-free");
+    page.value("document.getElementById('free').click()");
     // An event leads to its time.
     page.value("document.querySelector('#happened button').click()");
     page.wait("!/, 0 s to /.test(document.querySelector('.plot canvas[role=img]').getAttribute('aria-label'))");
@@ -233,6 +253,29 @@ fn cursors_measure_all_points_and_a_trigger_finds_the_cycle() {
         assert!((found - wanted).abs() < 5e-3 * (high - low), "{what}: {found}, not {wanted}; {head} {cells:?}");
     }
     assert!((cells[6] - (high - low)).abs() < 1e-3 * (high - low), "{cells:?}");
+
+    // The table between the cursors is that of the export, to the bit.
+    page.value("URL.createObjectURL = blob => { blob.text().then(text => { window.csv = text; }); return 'data:,'; }");
+    page.value(
+        "[...document.querySelectorAll('#cursors > button')].find(b => b.textContent.startsWith('CSV')).click()",
+    );
+    page.wait("window.csv");
+    let written = page.text("window.csv");
+    let mut written = written.lines();
+    let names: Vec<&str> = written.next().unwrap().split(',').collect();
+    let place = names.iter().position(|name| *name == "body.v [rpm]").expect("a column");
+    let written: Vec<(f64, f64)> = written
+        .map(|line| {
+            let cells: Vec<&str> = line.split(',').collect();
+            assert_eq!(cells.len(), names.len(), "{line}");
+            (cells[0].parse().unwrap(), cells[place].parse().unwrap())
+        })
+        .collect();
+    assert!(written.len() > 1000 && written.len().abs_diff(inside.len()) <= 2, "{} {}", written.len(), inside.len());
+    for (t, y) in &written {
+        let wanted = rows.iter().find(|row| (row.0 - t).abs() < 1e-6).expect("a row of the export");
+        assert_eq!(y.to_bits(), wanted.1.to_bits(), "at {t} s");
+    }
 
     // The first rise above 20 rpm, and the next ones, each at its cycle.
     let rises: Vec<f64> =

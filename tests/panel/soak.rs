@@ -3,11 +3,10 @@
 //! `FRIC_SOAK`: for how many seconds; 600 for the full test.
 
 use crate::browser::browser;
+use crate::client::Client;
 use crate::{Panel, folder, fric};
 use serde_json::json;
 use std::fs;
-use std::io::{Read, Write};
-use std::net::TcpStream;
 use std::process::{Child, Stdio};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -20,71 +19,6 @@ impl Drop for Rig {
     fn drop(&mut self) {
         let _ = self.0.kill();
         let _ = self.0.wait();
-    }
-}
-
-/// A program of others that speaks the panel's protocol by hand.
-pub struct Client(TcpStream);
-
-impl Client {
-    fn open(panel: &Panel, views: &[String]) -> Client {
-        Client::connect(panel.origin().trim_start_matches("http://"), panel.key(), views)
-    }
-
-    /// Connects to a panel at this address.
-    pub fn connect(own: &str, key: &str, views: &[String]) -> Client {
-        let mut stream = TcpStream::connect(own).unwrap();
-        let request = format!(
-            "GET /socket HTTP/1.1\r\nHost: {own}\r\nOrigin: http://{own}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n\
-             Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n"
-        );
-        stream.write_all(request.as_bytes()).unwrap();
-        let mut head = Vec::new();
-        while !head.ends_with(b"\r\n\r\n") {
-            let mut byte = [0];
-            stream.read_exact(&mut byte).unwrap();
-            head.push(byte[0]);
-        }
-        let mut client = Client(stream);
-        client.say(&format!("key {key}"));
-        // What asks before the panel has said what there is asks in vain.
-        std::thread::sleep(Duration::from_millis(300));
-        views.iter().for_each(|view| client.say(view));
-        client
-    }
-
-    /// Says a line.
-    pub fn say(&mut self, line: &str) {
-        let mut bytes = vec![0x81];
-        match u8::try_from(line.len()) {
-            Ok(short) if short < 126 => bytes.push(0x80 | short),
-            _ => bytes.extend([0x80 | 126, (line.len() >> 8) as u8, line.len() as u8]),
-        }
-        bytes.extend([0; 4]);
-        bytes.extend(line.as_bytes());
-        let _ = self.0.write_all(&bytes);
-    }
-
-    /// Reads a message: its opcode and its bytes; none at the end.
-    fn message(&mut self) -> Option<(u8, Vec<u8>)> {
-        let mut head = [0; 2];
-        self.0.read_exact(&mut head).ok()?;
-        let length = match head[1] & 0x7f {
-            126 => {
-                let mut more = [0; 2];
-                self.0.read_exact(&mut more).ok()?;
-                usize::from(u16::from_be_bytes(more))
-            }
-            127 => {
-                let mut more = [0; 8];
-                self.0.read_exact(&mut more).ok()?;
-                u64::from_be_bytes(more) as usize
-            }
-            short => usize::from(short),
-        };
-        let mut bytes = vec![0; length];
-        self.0.read_exact(&mut bytes).ok()?;
-        Some((head[0] & 15, bytes))
     }
 }
 
@@ -140,7 +74,8 @@ fn memory_is_flat_before_ten_viewers_of_which_one_is_deaf() {
     let frames = Arc::new(AtomicU64::new(0));
     let readers: Vec<_> = (0..8)
         .map(|i| {
-            let (mut client, over, frames) = (Client::open(&panel, &views), over.clone(), frames.clone());
+            let (mut client, over, frames) =
+                (Client::connect(panel.address(), panel.key(), &views), over.clone(), frames.clone());
             client.0.set_read_timeout(Some(Duration::from_secs(20))).unwrap();
             std::thread::spawn(move || {
                 while !over.load(Ordering::Relaxed) {
@@ -157,7 +92,7 @@ fn memory_is_flat_before_ten_viewers_of_which_one_is_deaf() {
             })
         })
         .collect();
-    let deaf = Client::open(&panel, &views);
+    let deaf = Client::connect(panel.address(), panel.key(), &views);
     let heap = || {
         page.call("HeapProfiler.enable", json!({}));
         page.call("HeapProfiler.collectGarbage", json!({}));

@@ -1,6 +1,7 @@
 use super::*;
 use crate::frame::{Block, Frame, PATH};
-use crate::line::View;
+use crate::line::{self, View};
+use crate::subject::Page;
 use serde_json::{Value, json};
 use std::io::{Read, Write};
 use std::sync::Mutex;
@@ -40,7 +41,8 @@ impl Subject for Counting {
             .take_while(|_| curve == 0)
             .all(|k| each(f64::from(k) / 100.0, f64::from(k % 100)));
     }
-    fn say(&self, words: &str) -> Result<String, String> {
+    fn say(&self, page: Page, words: &str) -> Result<String, String> {
+        assert!(!page.guest || line::seen(words).1 == "stop", "{words}");
         self.said.lock().unwrap().push(words.into());
         if words == "no" { Err("not \u{202e}now".into()) } else { Ok("yes".into()) }
     }
@@ -57,7 +59,8 @@ fn open() -> Open {
     let (subject, bell) = (Arc::new(Counting::default()), Bell::default());
     let panel = Panel::open(0, subject.clone(), bell.clone()).unwrap();
     let link = panel.link();
-    let (port, key) = (panel.shared.port, link.split_once('#').unwrap().1.to_string());
+    let (port, key) =
+        (link.split(['/', ':']).nth(4).unwrap().parse().unwrap(), link.split_once('#').unwrap().1.to_string());
     thread::spawn(move || panel.serve());
     Open { subject, bell, port, key }
 }
@@ -175,6 +178,64 @@ fn without_the_key_nothing_is_told_and_nothing_obeyed() {
         stream.read(&mut byte).is_ok()
     });
     assert!(left && begun.elapsed().as_secs() < 8, "{:?}", begun.elapsed());
+}
+
+/// The door for others has a name and a key of its own: neither key opens the other door, and a guest's lines but `stop`
+/// are refused whatever stands before and around them.
+///
+/// Mutants tried: one key for both doors; the names of one door at the other; `stop` as a prefix; no check at all.
+#[test]
+fn guests_look_and_may_stop_and_no_more() {
+    let (subject, bell) = (Arc::new(Counting::default()), Bell::default());
+    let panel = Panel::open(0, subject.clone(), bell.clone()).unwrap();
+    let panel = panel.shared_at("127.0.0.1:0".parse().unwrap()).unwrap();
+    let [own, share] = [panel.link(), panel.share_link().unwrap()].map(|link| {
+        let (address, key) = link.trim_start_matches("http://").split_once("/#").unwrap();
+        (address.rsplit_once(':').unwrap().1.parse::<u16>().unwrap(), key.to_string())
+    });
+    assert!(own.0 != share.0 && own.1 != share.1);
+    thread::spawn(move || panel.serve());
+    let door = |port, key: &str| Open { subject: subject.clone(), bell: bell.clone(), port, key: key.into() };
+    for (port, key) in [(own.0, &share.1), (share.0, &own.1)] {
+        let told = text(&mut door(port, key).socket(&format!("key {key}")));
+        assert!(told.contains("wrong key"), "{told}");
+    }
+    // `localhost` is a name of the own door only.
+    assert!(door(own.0, "").get("/").starts_with("HTTP/1.1 200 "));
+    assert!(door(share.0, "").get("/").starts_with("HTTP/1.1 421 "));
+    let mut guest = door(share.0, &share.1).viewer();
+    for line in [
+        "1 yes",
+        "1 @0 set a = 1",
+        "1 @0 arm",
+        "1 stop now",
+        "1 nonstop",
+        "1 @stop",
+        "1 take",
+        "1 @0 @0 stop",
+        "1 again",
+    ] {
+        guest.send(Message::text(line)).unwrap();
+        let told = text(&mut guest);
+        assert!(told.contains("this link is for looking"), "{line}: {told}");
+    }
+    assert_eq!(*subject.said.lock().unwrap(), [""; 0]);
+    for line in ["1 stop", "2 @0 stop", "3 @-9 stop", "4 @nan stop"] {
+        guest.send(Message::text(line)).unwrap();
+        assert!(text(&mut guest).contains("\"ok\""), "{line}");
+    }
+    assert_eq!(subject.said.lock().unwrap().len(), 4);
+    // It looks.
+    guest.send(Message::text("ack 1")).unwrap();
+    guest.send(Message::text("view 0 0 all 10")).unwrap();
+    assert_eq!(number(&frame(&mut guest)), 2);
+    // Both have their numbers, in the order of coming.
+    assert_eq!(bell.viewers(), 1);
+    let mut socket = door(own.0, &own.1).socket(&format!("key {}", own.1));
+    let told = text(&mut socket);
+    assert!(told.contains("\"page\":2") && told.contains("\"guest\":false"), "{told}");
+    let refused = Panel::open(0, subject, bell).unwrap().shared_at("0.0.0.0:0".parse().unwrap());
+    assert!(refused.err().is_some_and(|why| why.contains("name one of this computer")));
 }
 
 /// Whatever comes before the right key: whole frames of every kind, broken ones, and bytes that are no frames. None of

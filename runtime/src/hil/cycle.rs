@@ -12,7 +12,7 @@ use super::control::{Control, CycleInputs, Reading, Source};
 use super::counts::Counts;
 use super::live::{Judge, Objection};
 use super::operator::{self, Answer, Commands, Reason};
-pub use super::operator::{Command, Operator};
+pub use super::operator::{Attention, Command, Operator, Watched};
 use super::stage::{Stage, StageGauge};
 use super::trace::{self, Shape};
 use super::watches::Bounds;
@@ -131,6 +131,8 @@ pub struct Hil {
     commands: Commands,
     /// Checks sets of parameters; none: every set is refused.
     judge: Option<Judge>,
+    /// Stops the rig when nobody watches it; none: nobody needs to.
+    attention: Option<Arc<Attention>>,
     /// Number of the operator command whose set acts in this cycle.
     set: Option<u64>,
     due_ns: u64,
@@ -196,6 +198,7 @@ impl Hil {
             gauges: Arc::new(Gauges { values, ..Gauges::default() }),
             commands,
             judge: None,
+            attention: None,
             set: None,
             due_ns,
             collect_ns: collect_ns.min(rig.period_ns),
@@ -225,6 +228,11 @@ impl Hil {
     /// Permits changes of parameters while the rig runs, as far as this judge accepts them.
     pub fn judged_by(&mut self, judge: Judge) {
         self.judge = Some(judge);
+    }
+
+    /// Stops the rig when nobody watches it any more, and arms it only once somebody does.
+    pub fn attended_by(&mut self, attention: Arc<Attention>) {
+        self.attention = Some(attention);
     }
 
     /// The gauges, for other threads.
@@ -389,6 +397,10 @@ impl Hil {
         if stops {
             self.stop();
         }
+        let watched = self.attention.as_ref().map_or(Watched::Yes, |attention| attention.now());
+        if watched == Watched::NoLonger && !self.stage().is_idle() {
+            self.wires.report(Cause::Unwatched);
+        }
         while let Some(said) = self.commands.next(now_ns, false) {
             let has_effect = match said.command {
                 Command::Mark(mark) => self.mark(&mark),
@@ -396,11 +408,16 @@ impl Hil {
                     self.commands.answer(said.number, Answer::Refused(Reason::Stopping));
                     continue;
                 }
+                Command::Arm if watched != Watched::Yes => {
+                    self.commands.answer(said.number, Answer::Refused(Reason::Unwatched));
+                    continue;
+                }
                 Command::Enable => self.fieldbus.request(Request::Enable),
                 Command::Arm => self.fieldbus.request(Request::Arm),
                 Command::Stop | Command::Set(_) => unreachable!("neither comes this way"),
             };
-            let answer = if has_effect { Answer::Taken } else { Answer::Refused(Reason::NotNow(self.stage())) };
+            let answer =
+                if has_effect { Answer::Taken(Some(self.k)) } else { Answer::Refused(Reason::NotNow(self.stage())) };
             self.commands.answer(said.number, answer);
         }
         if self.options.checks_only && self.fieldbus.step() == Step::AwaitArm {
@@ -411,7 +428,9 @@ impl Hil {
         if arms_itself && self.control.is_some() {
             match self.fieldbus.step() {
                 Step::AwaitEnable => _ = self.fieldbus.request(Request::Enable),
-                Step::AwaitArm if !self.options.checks_only => _ = self.fieldbus.request(Request::Arm),
+                Step::AwaitArm if !self.options.checks_only && watched == Watched::Yes => {
+                    _ = self.fieldbus.request(Request::Arm)
+                }
                 _ => {}
             }
         }
@@ -537,7 +556,7 @@ impl Hil {
         if let Some(number) = self.set.take() {
             let refused = control.refused_set().map(|status| Answer::Refused(Reason::Set(Objection::Model(status))));
             self.counts.refused_sets += u64::from(refused.is_some());
-            self.commands.answer(number, refused.unwrap_or(Answer::Taken));
+            self.commands.answer(number, refused.unwrap_or(Answer::Taken(Some(self.k))));
         }
         if !is_present(Protection::Recorded) {
             cycle.set.clear();

@@ -6,13 +6,17 @@ use super::control;
 use super::coupling::look_ahead;
 use super::cycle::{Hil, Options};
 use super::live::{Judge, Objection, Set};
-use super::operator::{Answer, Command, Mark, Operator, PLACES, Reason, Stamp, Ticket};
+use super::operator::{Answer, Attention, Command, Mark, Operator, PLACES, Reason, Stamp, Ticket, Watched};
 use super::simulated::{Pace, World};
 use crate::drive::Step;
+use crate::realtime::clock::monotonic_ns;
 use crate::rng::Chance;
+use crate::safety::Cause;
 use crate::testing::rigs;
 use abi::Slot;
 use std::collections::HashMap;
+use std::sync::Arc;
+use std::time::Duration;
 
 const MS: u64 = 1_000_000;
 
@@ -105,7 +109,10 @@ fn each_command_is_answered_once_and_accepted_sets_act() {
                 let Some(answer) = stand.operator.answer(*ticket) else { return true };
                 assert_eq!(stand.operator.answer(*ticket), None, "seed {seed}: an answer is given once");
                 match (answer, command) {
-                    (Answer::Taken, Command::Set(set)) => {
+                    (Answer::Taken(k), Command::Set(set)) => {
+                        // The cycle that it names is the one whose record holds it.
+                        assert_eq!(k, Some(stand.hil.last().k), "seed {seed}");
+                        assert_eq!(stand.hil.last().set, set.values(), "seed {seed}");
                         taken += 1;
                         for (slot, value) in set.values() {
                             let i = stand.slots.iter().position(|known| known == slot).unwrap();
@@ -119,7 +126,9 @@ fn each_command_is_answered_once_and_accepted_sets_act() {
                     (Answer::Refused(Reason::Set(_) | Reason::NotNow(_)), Command::Set(_)) => {
                         *counts.entry("refused").or_default() += 1;
                     }
-                    (Answer::Taken | Answer::Refused(Reason::NotNow(_)), _) => *counts.entry("other").or_default() += 1,
+                    (Answer::Taken(_) | Answer::Refused(Reason::NotNow(_)), _) => {
+                        *counts.entry("other").or_default() += 1
+                    }
                     (answer, command) => panic!("seed {seed}: {} gave {answer:?}", command.name()),
                 }
                 false
@@ -161,7 +170,7 @@ fn a_stop_acts_at_once_regardless_of_waiting_commands() {
     let set = other.set(&[(0, 0.5)]);
     while other.operator.say(set).is_ok() {}
     let ticket = other.operator.say(Command::Stop).unwrap();
-    assert_eq!(other.operator.answer(ticket), Some(Answer::Taken));
+    assert_eq!(other.operator.answer(ticket), Some(Answer::Taken(None)));
     other.hil.cycle();
     assert_eq!(other.hil.control().unwrap().supervisor().cause(), Some(crate::safety::Cause::Asked));
 }
@@ -186,9 +195,9 @@ fn old_commands_are_refused_except_a_stop() {
     assert_eq!(stand.hil.step(), Step::AwaitEnable);
     let fresh = stand.operator.say(Command::Enable).unwrap();
     stand.hil.cycle();
-    assert_eq!(stand.operator.answer(fresh), Some(Answer::Taken));
+    assert_eq!(stand.operator.answer(fresh), Some(Answer::Taken(Some(stand.hil.last().k))));
     let stop = stand.operator.say_at(Command::Stop, old).unwrap();
-    assert_eq!(stand.operator.answer(stop), Some(Answer::Taken));
+    assert_eq!(stand.operator.answer(stop), Some(Answer::Taken(None)));
     stand.hil.cycle();
     assert_eq!(stand.hil.control().unwrap().supervisor().cause(), Some(crate::safety::Cause::Asked));
 }
@@ -200,7 +209,8 @@ fn a_set_is_accepted_while_the_rig_is_stopped_or_waits() {
     let waits = stand.set(&[(0, 0.7)]);
     let waits = stand.operator.say(waits).unwrap();
     stand.hil.cycle();
-    assert_eq!((stand.operator.answer(waits), stand.present()[0]), (Some(Answer::Taken), 0.7));
+    assert!(matches!(stand.operator.answer(waits), Some(Answer::Taken(Some(_)))));
+    assert_eq!(stand.present()[0], 0.7);
     let mut stand = Stand::new(true);
     stand.reach(Step::Armed);
     stand.operator.stopper().stop();
@@ -208,7 +218,62 @@ fn a_set_is_accepted_while_the_rig_is_stopped_or_waits() {
     let stopped = stand.set(&[(0, 0.9)]);
     let stopped = stand.operator.say(stopped).unwrap();
     stand.hil.cycle();
-    assert_eq!((stand.operator.answer(stopped), stand.present()[0]), (Some(Answer::Taken), 0.9));
+    assert!(matches!(stand.operator.answer(stopped), Some(Answer::Taken(Some(_)))));
+    assert_eq!(stand.present()[0], 0.9);
+}
+
+/// Mutants tried: armed without anybody; stopped while the drives are idle; a limit in the wrong direction.
+#[test]
+fn a_rig_that_must_be_watched_is_armed_and_runs_only_while_it_is() {
+    let attention = Attention::new(Duration::from_secs(2));
+    assert_eq!((attention.at(0), attention.at(u64::MAX)), (Watched::NotYet, Watched::NotYet));
+    attention.seen();
+    let now = monotonic_ns();
+    for (after, wanted) in
+        [(0, Watched::Yes), (1_900, Watched::Yes), (2_100, Watched::NoLonger), (9_000, Watched::NoLonger)]
+    {
+        assert_eq!(attention.at(now + after * MS), wanted, "after {after} ms");
+    }
+
+    let mut stand = Stand::new(false);
+    let long = Arc::new(Attention::new(Duration::from_secs(3600)));
+    stand.hil.attended_by(long.clone());
+    stand.reach(Step::AwaitEnable);
+    stand.operator.say(Command::Enable).unwrap();
+    stand.reach(Step::AwaitArm);
+    let early = stand.operator.say(Command::Arm).unwrap();
+    stand.hil.cycle();
+    assert_eq!(stand.operator.answer(early), Some(Answer::Refused(Reason::Unwatched)));
+    long.seen();
+    stand.operator.say(Command::Arm).unwrap();
+    stand.reach(Step::Armed);
+    (0..50).for_each(|_| stand.hil.cycle());
+    assert_eq!(stand.hil.control().unwrap().supervisor().cause(), None);
+    // Seen, but longer ago than this one allows.
+    let short = Arc::new(Attention::new(Duration::ZERO));
+    short.seen();
+    stand.hil.attended_by(short.clone());
+    stand.hil.cycle();
+    assert_eq!(stand.hil.control().unwrap().supervisor().cause(), Some(Cause::Unwatched));
+    while stand.hil.ended().is_none() {
+        stand.hil.cycle();
+    }
+    assert!(stand.hil.ended().unwrap().words().contains("nobody watches"));
+
+    // One that arms itself waits until it is seen, and drives without torque need nobody.
+    let mut stand = Stand::new(true);
+    let long = Arc::new(Attention::new(Duration::from_secs(3600)));
+    stand.hil.attended_by(long.clone());
+    stand.reach(Step::AwaitArm);
+    (0..200).for_each(|_| stand.hil.cycle());
+    assert_eq!(stand.hil.step(), Step::AwaitArm);
+    long.seen();
+    stand.reach(Step::Armed);
+    let mut stand = Stand::new(false);
+    stand.hil.attended_by(short);
+    stand.reach(Step::AwaitEnable);
+    (0..50).for_each(|_| stand.hil.cycle());
+    assert_eq!(stand.hil.ended(), None);
 }
 
 #[test]

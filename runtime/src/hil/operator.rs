@@ -94,8 +94,8 @@ impl Command {
 /// Result of a command.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub enum Answer {
-    /// It takes effect in this cycle.
-    Taken,
+    /// It takes effect in the cycle of this number, as in the log; a stop in the next one, whatever its number.
+    Taken(Option<u64>),
     /// It has no effect.
     Refused(Reason),
 }
@@ -115,6 +115,8 @@ pub enum Reason {
     Set(Objection),
     /// The queue is full.
     Full,
+    /// Nobody watches yet, and the rig stops when nobody does.
+    Unwatched,
     /// The rig has ended.
     Ended,
 }
@@ -129,6 +131,7 @@ impl Reason {
             Reason::Unjudged => "no parameter of this rig may change while it runs".into(),
             Reason::Set(objection) => format!("{objection:?}"),
             Reason::Full => format!("{PLACES} commands wait already: say it again"),
+            Reason::Unwatched => "nobody watches yet, and with --dead-man somebody must: open the panel".into(),
             Reason::Ended => "the rig has ended".into(),
         }
     }
@@ -173,6 +176,51 @@ impl Stopper {
     /// Requests a controlled stop in the next cycle.
     pub fn stop(&self) {
         self.0.stop.store(true, Ordering::Relaxed);
+    }
+}
+
+/// Whether anybody watches a rig: a dead man's switch. Nobody has watched yet until the first [`Attention::seen`].
+#[derive(Debug)]
+pub struct Attention {
+    limit_ns: u64,
+    seen_ns: AtomicU64,
+}
+
+/// What an [`Attention`] says.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub enum Watched {
+    /// Nobody has watched yet.
+    NotYet,
+    /// Somebody watches.
+    Yes,
+    /// Somebody did, and nobody has for longer than the limit.
+    NoLonger,
+}
+
+impl Attention {
+    /// With this limit.
+    pub fn new(limit: Duration) -> Attention {
+        let limit_ns = u64::try_from(limit.as_nanos()).unwrap_or(u64::MAX);
+        Attention { limit_ns, seen_ns: AtomicU64::new(0) }
+    }
+
+    /// Somebody has just seen the rig: from any thread.
+    pub fn seen(&self) {
+        self.seen_ns.store(monotonic_ns().max(1), Ordering::Relaxed);
+    }
+
+    /// Whether anybody watches, at a time of the machine's monotonic clock.
+    pub fn at(&self, now_ns: u64) -> Watched {
+        match self.seen_ns.load(Ordering::Relaxed) {
+            0 => Watched::NotYet,
+            seen_ns if now_ns.saturating_sub(seen_ns) > self.limit_ns => Watched::NoLonger,
+            _ => Watched::Yes,
+        }
+    }
+
+    /// Whether anybody watches now.
+    pub fn now(&self) -> Watched {
+        self.at(monotonic_ns())
     }
 }
 
@@ -225,7 +273,7 @@ impl Operator {
         let number = self.next;
         if command == Command::Stop {
             self.shared.stop.store(true, Ordering::Relaxed);
-            self.remember(number, Answer::Taken);
+            self.remember(number, Answer::Taken(None));
         } else if self.commands.is_abandoned() {
             return Err(Reason::Ended);
         } else if self.open == PLACES || !self.commands.push(Said { number, stamp, command }) {

@@ -86,6 +86,7 @@ pub fn cause(rig: &Rig, model: &Description, signals: &[Signal], cause: Cause, t
             "the shaft does not move as its inertia and torques say: commands cannot look ahead".into()
         }
         Cause::Energy => "more energy came back than the friction can hold: the loop is not stable".into(),
+        Cause::Unwatched => "nobody watches any more: no page of the panel was drawn for the time of --dead-man".into(),
         Cause::Watchdog => "no cycle ended in time: the watchdog stopped the drives".into(),
     }
 }

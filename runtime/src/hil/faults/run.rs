@@ -472,8 +472,8 @@ impl<'a> ScriptRun<'a> {
         let mut waits = Vec::new();
         for (ticket, value) in std::mem::take(&mut program.said) {
             match (program.operator.answer(ticket), value) {
-                (Some(Answer::Taken), Some(value)) => program.twin = value,
-                (Some(Answer::Taken), None) => {
+                (Some(Answer::Taken(_)), Some(value)) => program.twin = value,
+                (Some(Answer::Taken(_)), None) => {
                     return Err(self.broken(Broken::Set, "a set was taken that is torn, or from long ago"));
                 }
                 (Some(Answer::Refused(why)), Some(_)) if !stops && why != Reason::Stopping => {
