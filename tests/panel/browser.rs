@@ -140,6 +140,11 @@ impl Heard {
 }
 
 impl Browser {
+    /// Its process.
+    pub fn pid(&self) -> u32 {
+        self.child.lock().unwrap().id()
+    }
+
     /// Kills it.
     pub fn kill(&self) {
         let mut child = self.child.lock().unwrap();
