@@ -1,7 +1,8 @@
 //! A running model: its block of numbers and its code, with every access checked.
 
 use crate::description::{Automaton, Delay, Description, Kind, Quantity, Slot};
-use crate::table::{Code, Function, Machine, keep_clock};
+use crate::follow::{Follow, Rows, RowsMut};
+use crate::table::{Code, Function, Machine, keep_clock, keep_time};
 use std::sync::Arc;
 
 /// One running instance of a compiled model.
@@ -203,6 +204,54 @@ impl Instance {
     /// Advances by up to `n` fixed steps, stops at the first non-zero status and returns it.
     pub fn advance(&mut self, n: u64) -> u64 {
         self.call_up_to(Function::Step, n)
+    }
+
+    /// Makes a fixed step for each of `count` rows: with the inputs of this row, and then writes the outputs to a row. Stops
+    /// at the first status that is not 0, after writing its row. Returns the number of steps and the status. The bits are
+    /// those of [`set`](Instance::set), [`advance`](Instance::advance) and [`get`](Instance::get) for each row.
+    ///
+    /// # Panics
+    /// If the arrays have fewer rows, or `follow` belongs to another program: a bug in the caller.
+    pub fn follow(&mut self, follow: &Follow, inputs: Rows, mut outputs: RowsMut, count: u64) -> (u64, u64) {
+        follow.check(count, &inputs, &outputs);
+        let before = self.get(Slot::COUNT);
+        // The code's count tells how many steps it made, as long as adding 1 is exact.
+        let is_exact = before >= 0.0 && before.floor() == before && before + count as f64 <= 9007199254740992.0;
+        let (numbers, pool) = (&mut self.numbers[..self.size], &self.description.pool);
+        let status = match is_exact && count > 0 {
+            true => follow.run(numbers, pool, count, &inputs, &mut outputs),
+            false => None,
+        };
+        let Some(status) = status else { return self.follow_by_calls(follow, inputs, outputs, count) };
+        let done = (self.get(Slot::COUNT) - before) as u64;
+        let last = (done as usize - 1) * inputs.stride;
+        for (k, slot) in follow.inputs().iter().enumerate() {
+            self.numbers[slot.index()] = inputs.numbers[last + k];
+        }
+        keep_time(&mut self.numbers);
+        (done, status)
+    }
+
+    /// The same by a call of the step for each row.
+    fn follow_by_calls(&mut self, follow: &Follow, inputs: Rows, outputs: RowsMut, count: u64) -> (u64, u64) {
+        let sliced = std::mem::replace(&mut self.is_sliced, false);
+        let step = std::mem::replace(&mut self.step, self.code.clone());
+        self.is_prepared &= !sliced;
+        let (mut done, mut status) = (0, 0);
+        while done < count && status == 0 {
+            let row = done as usize;
+            for (k, slot) in follow.inputs().iter().enumerate() {
+                self.set(*slot, inputs.numbers[row * inputs.stride + k]);
+            }
+            status = self.advance(1);
+            for (k, slot) in follow.outputs().iter().enumerate() {
+                outputs.numbers[row * outputs.stride + k] = self.get(*slot);
+            }
+            done += 1;
+        }
+        (self.is_sliced, self.step) = (sliced, step);
+        self.is_prepared &= !sliced;
+        (done, status)
     }
 }
 

@@ -214,6 +214,58 @@ impl Batch {
         n
     }
 
+    /// A fixed step of all lanes for each row of inputs, and a row of outputs after each. A row has a column for each slot, a
+    /// column a number for each lane: `given[(row · inputs + column) · width + lane]`, and `taken` alike. Does not stop at a
+    /// status that is not 0: `failed` receives the number of such a row, and may look at the statuses and the blocks of its
+    /// lanes. Each lane has the bits of an instance alone; the others are not changed by what has failed in one.
+    ///
+    /// # Panics
+    /// If the arrays do not have the same number of rows, or the pool is too short: a bug in the caller.
+    pub fn follow(
+        &mut self,
+        pool: &[f64],
+        (inputs, given): (&[Slot], &[f64]),
+        (outputs, taken): (&[Slot], &mut [f64]),
+        rows: usize,
+        failed: &mut dyn FnMut(usize, &Batch),
+    ) {
+        let width = self.lanes.width;
+        assert_eq!(given.len(), rows * inputs.len() * width, "{rows} rows of inputs");
+        assert_eq!(taken.len(), rows * outputs.len() * width, "{rows} rows of outputs");
+        let begins = |slots: &[Slot]| slots.iter().map(|slot| self.begin_of(*slot)).collect::<Vec<usize>>();
+        let (from, to) = (begins(inputs), begins(outputs));
+        for row in 0..rows {
+            for (k, at) in from.iter().enumerate() {
+                let column = &given[(row * inputs.len() + k) * width..][..width];
+                self.flat_mut()[*at..*at + width].copy_from_slice(column);
+            }
+            self.advance(pool, 1);
+            for (k, at) in to.iter().enumerate() {
+                let column = &mut taken[(row * outputs.len() + k) * width..][..width];
+                column.copy_from_slice(&self.flat()[*at..*at + width]);
+            }
+            if (0..width).any(|lane| self.status(lane) != 0) {
+                failed(row, self);
+            }
+        }
+    }
+
+    /// Index of the number of a slot in the first lane.
+    fn begin_of(&self, slot: Slot) -> usize {
+        assert!(slot.index() < self.lanes.size, "slot {} of {}", slot.0, self.lanes.size);
+        slot.index() * self.lanes.width
+    }
+
+    fn flat(&self) -> &[f64] {
+        // SAFETY: a line is eight adjacent words without padding, and any word is a double.
+        unsafe { std::slice::from_raw_parts(self.numbers.as_ptr().cast(), 8 * self.numbers.len()) }
+    }
+
+    fn flat_mut(&mut self) -> &mut [f64] {
+        // SAFETY: as in `flat`, and the borrow is exclusive.
+        unsafe { std::slice::from_raw_parts_mut(self.numbers.as_mut_ptr().cast(), 8 * self.numbers.len()) }
+    }
+
     /// Advances all lanes by up to `n` fixed steps and returns the number of steps done. Stops after a step at which
     /// the status of a lane is not 0. Time is only stored as far as the code does so: see
     /// [`keep_time`](crate::table::keep_time).

@@ -27,6 +27,7 @@ pub mod rosenbrock;
 pub mod lanes;
 pub mod distributed_step;
 pub mod table;
+pub mod follow;
 pub mod series;
 pub mod instance;
 pub mod rig;

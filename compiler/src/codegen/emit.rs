@@ -65,6 +65,8 @@ struct Function {
     scratch: Option<clif::Value>,
     /// Address of the values of the leading loop for the first step.
     leading: Option<clif::Value>,
+    /// The rows of a loop that follows an array: addresses and distances in bytes of inputs and of outputs.
+    rows: Option<[(clif::Value, clif::Value); 2]>,
     /// Number of iterations that the call asks for.
     count: Option<clif::Value>,
     /// Whether it is a piece, which returns no status.
@@ -203,21 +205,28 @@ impl<'a> Emitter<'a> {
     ) {
         let is_piece = called == Entry::Piece;
         target.signature = if is_piece { signature_of_piece(self.isa) } else { signature(self.isa) };
-        if self.cfg.leading.is_some() {
-            target.signature.params.push(AbiParam::new(types::I64));
-        }
+        let more = if self.cfg.rows.is_some() { 3 } else { usize::from(self.cfg.leading.is_some()) };
+        target.signature.params.extend(vec![AbiParam::new(types::I64); more]);
         let mut b = FunctionBuilder::new(target, context);
         let order = self.cfg.order(entry);
         let first = b.create_block();
         b.append_block_params_for_function_params(first);
         b.switch_to_block(first);
-        let &[block, pool, third, ref leading @ ..] = b.block_params(first) else { unreachable!("three parameters") };
-        let leading = leading.first().copied();
+        let &[block, pool, third, ref more @ ..] = b.block_params(first) else { unreachable!("three parameters") };
+        let more = more.to_vec();
+        let rows = if let [inputs, outputs, strides] = more[..] {
+            let mut stride = |at| b.ins().load(types::I64, MemFlagsData::trusted(), strides, at);
+            Some([(inputs, stride(0)), (outputs, stride(8))])
+        } else {
+            None
+        };
+        let leading = more.first().copied().filter(|_| rows.is_none());
         self.now = Function {
             block: Some(block),
             pool: Some(pool),
             scratch: is_piece.then_some(third),
             leading,
+            rows,
             count: (!is_piece).then_some(third),
             is_piece,
             // x86-64 would build a constant in a general register first.
@@ -447,7 +456,11 @@ impl<'a> Emitter<'a> {
                 let mut next = self.args(&again.args, b);
                 next.push(BlockArg::Value(remaining));
                 for pointer in &repeats.pointers {
-                    next.push(BlockArg::Value(b.ins().iadd_imm_s(pointer.now.expect(begun), 8 * pointer.stride)));
+                    let now = pointer.now.expect(begun);
+                    next.push(BlockArg::Value(match self.rows(pointer.area) {
+                        Some((_, stride)) => b.ins().iadd(now, stride),
+                        None => b.ins().iadd_imm_s(now, 8 * pointer.stride),
+                    }));
                 }
                 let head = self.now.blocks[&again.block];
                 let (exit, args) = self.target(done, b);
@@ -488,8 +501,19 @@ impl<'a> Emitter<'a> {
             Area::Block => self.now.block,
             Area::Scratch => self.now.scratch,
             Area::Leading => self.now.leading,
+            Area::Inputs | Area::Outputs => self.rows(area).map(|(address, _)| address),
         }
         .expect("the function has this area")
+    }
+
+    /// Address and distance in bytes of the rows of an area.
+    fn rows(&self, area: Area) -> Option<(clif::Value, clif::Value)> {
+        let [inputs, outputs] = self.now.rows?;
+        match area {
+            Area::Inputs => Some(inputs),
+            Area::Outputs => Some(outputs),
+            Area::Block | Area::Scratch | Area::Leading => None,
+        }
     }
 
     fn base_of_pool(&self) -> clif::Value {

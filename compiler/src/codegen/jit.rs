@@ -4,18 +4,19 @@
 //! both at once, and is freed when the last clone of the code is dropped. The code has no symbols, calls nothing except
 //! its own pieces and needs no relocation at run time.
 
-use super::target::{Bytes, FunctionCompiler, here_with};
+use super::target::{Bytes, FunctionCompiler, here, here_with};
 use crate::codegen::emit::signature;
 use crate::codegen::executable_memory::{Executable, Memory};
 use crate::codegen::forms::{Context, Form, Options};
 use crate::codegen::lanes::{self, Width};
 use crate::codegen::passes;
 use crate::ir::Func;
-use crate::ir::cfg::{Entry as Called, Leading};
+use crate::ir::cfg::{Entry as Called, Leading, Rows};
 use crate::ir::verify::{Stage, verify};
 use abi::distributed_step::{DistributedStep, RemainingEntry};
+use abi::follow::{Follow, FollowEntry};
 use abi::table::{Entry, Machine, Prepared};
-use abi::{Function, Layout};
+use abi::{Function, Layout, Slot};
 use cranelift_module::Module;
 use std::sync::Arc;
 
@@ -104,6 +105,32 @@ fn distributed(step: &Func, layout: &Layout, pool_len: usize, options: &Options)
     // the step, which is verified, and loads one output of `own` for each value of the leading loop; code without calls
     // does not unwind.
     unsafe { DistributedStep::new(invariants, instants, own.clone(), loads.clone(), entry, Arc::new(executable)) }
+}
+
+/// Compiles the loop of a fixed step over rows of inputs and outputs.
+///
+/// # Errors
+/// If there is no machine code for this processor, or the step is too long.
+///
+/// # Panics
+/// As [`compile`], and as [`Follow::new`].
+pub fn follow(
+    step: &Func,
+    layout: &Layout,
+    pool_len: usize,
+    inputs: &[Slot],
+    outputs: &[Slot],
+) -> Result<Follow, Unsupported> {
+    verify(step, layout, pool_len, Stage::Expanded).unwrap_or_else(|fault| panic!("{fault}"));
+    let follow = Follow::new(layout, inputs, outputs);
+    let rows = Rows { inputs: inputs.to_vec(), outputs: outputs.to_vec() };
+    let bytes = FunctionCompiler::new(here()?).on_rows(step, rows)?;
+    let executable = Executable::new(&bytes.code, bytes.alignment as u64)?;
+    // SAFETY: `address` is the start of code with the signature of `FollowEntry`.
+    let entry = unsafe { std::mem::transmute::<*const u8, FollowEntry>(executable.address()) };
+    // SAFETY: the entry lives as long as its memory; every access to block and pool is that of the step, which is verified,
+    // and `form_loop` makes one column for each input and output; code without calls does not unwind.
+    Ok(unsafe { follow.with_code(entry, layout.size(), pool_len, Arc::new(executable)) })
 }
 
 type Entries = [Option<Entry>; Function::ALL.len()];

@@ -18,7 +18,7 @@ use crate::codegen::sink::sink;
 use crate::codegen::specialise_modes::specialise_modes;
 use crate::codegen::unswitch::unswitch;
 use crate::ir::Func;
-use crate::ir::cfg::{Cfg, Entry};
+use crate::ir::cfg::{Cfg, Entry, Rows};
 use crate::ir::cfg_verify::verify_cfg;
 use Form::{Distributed, Long, Loop, Once, Single};
 
@@ -87,7 +87,16 @@ impl Pass {
 
 /// Runs all passes on a function.
 pub fn run(func: &Func, form: Form, called: Entry, context: &Context) -> Cfg {
-    let mut cfg = Cfg::straight(func, called);
+    apply_all(Cfg::straight(func, called), form, context)
+}
+
+/// Runs all passes on a step in a loop over rows of inputs and outputs.
+pub fn run_on_rows(func: &Func, rows: Rows, context: &Context) -> Cfg {
+    let cfg = Cfg { rows: Some(rows), ..Cfg::straight(func, Entry::Several) };
+    apply_all(cfg, Loop, context)
+}
+
+fn apply_all(mut cfg: Cfg, form: Form, context: &Context) -> Cfg {
     for pass in &LATE {
         let runs = pass.apply(&mut cfg, form, context);
         // A step that is not distributed has its code already.

@@ -10,7 +10,7 @@ use crate::codegen::form_loop::is_idempotent;
 use crate::codegen::forms::{Context as Passes, Form, Options, Registers};
 use crate::codegen::passes;
 use crate::ir::Func;
-use crate::ir::cfg::{BlockId, Cfg, Entry, Inst};
+use crate::ir::cfg::{BlockId, Cfg, Entry, Inst, Rows};
 use abi::Layout;
 use abi::image::{Feature, Target};
 use cranelift_codegen::binemit::Reloc;
@@ -105,6 +105,18 @@ impl<'a> FunctionCompiler<'a> {
     /// that the leading loop has computed, one for each of `lanes` steps.
     pub fn remaining_loop(&mut self, func: &Func, graph: &Cfg, lanes: usize) -> Result<Bytes, Unsupported> {
         self.entry(func, graph, (BlockId(0), Entry::Several), lanes)
+    }
+
+    /// Compiles the loop of a step over rows of inputs and outputs, with the signature of [`abi::follow::FollowEntry`].
+    ///
+    /// # Errors
+    /// If the step is divided into pieces.
+    pub fn on_rows(&mut self, func: &Func, rows: Rows) -> Result<Bytes, Unsupported> {
+        if self.is_long(func) {
+            return Err(Unsupported(format!("`{}` is divided into pieces", func.name)));
+        }
+        let graph = passes::run_on_rows(func, rows, &Passes { layout: None, options: &self.options });
+        self.entry(func, &graph, (BlockId(0), Entry::Several), 0)
     }
 
     /// Compiles one function of a graph that calls no pieces.

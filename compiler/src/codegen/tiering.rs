@@ -16,11 +16,12 @@ use crate::math;
 use crate::numerics::{autodiff, fixed_step, rosenbrock};
 use crate::opt::guard_reduction::reduce_guards;
 use crate::opt::{self, Context};
+use abi::follow::Follow;
 use abi::lanes::Lanes;
 use abi::plan::Method;
 use abi::rosenbrock::layout::Trial;
 use abi::table::{Code, Interpret, Machine};
-use abi::{Description, Function, Layout};
+use abi::{Description, Function, Layout, Slot};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, OnceLock};
 use std::thread::Builder;
@@ -73,6 +74,21 @@ pub fn lanes(program: &Program, method: Method) -> Option<Lanes> {
         _ => width.vectors(),
     };
     Width::here_all().find_map(|width| lanes_of(program, method, width, vectors(width)))
+}
+
+/// The loop of a fixed step over rows of inputs and outputs. It calls the step for each row where `interpret` is set or
+/// there is no machine code for the loop; the bits are the same.
+///
+/// # Panics
+/// For the adaptive method, and as [`Follow::new`].
+pub fn follow(program: &Program, method: Method, inputs: &[Slot], outputs: &[Slot], interpret: bool) -> Follow {
+    let Description { layout, pool, .. } = &program.description;
+    let compiled = || {
+        let step = math::expand(&step(program, method));
+        jit::follow(&step, layout, pool.len(), inputs, outputs).ok()
+    };
+    let by_calls = || Follow::new(layout, inputs, outputs);
+    if interpret { by_calls() } else { compiled().unwrap_or_else(by_calls) }
 }
 
 /// The function that lanes execute for a method, before its elementary functions are expanded.

@@ -44,6 +44,10 @@ pub enum Area {
     Scratch,
     /// Values of the leading loop of a distributed step, by value and step.
     Leading,
+    /// Rows of inputs, a row for each step; the stride counts rows, whose distance is an argument of the call.
+    Inputs,
+    /// Rows of outputs, alike.
+    Outputs,
 }
 
 /// A number in memory.
@@ -186,6 +190,15 @@ pub struct Leading {
     pub size: usize,
 }
 
+/// The columns of the rows that a loop reads and writes: see [`abi::follow`].
+#[derive(Clone, PartialEq, Debug)]
+pub struct Rows {
+    /// Slots of inputs that are read from a row.
+    pub inputs: Vec<Slot>,
+    /// Slots that are also written to a row.
+    pub outputs: Vec<Slot>,
+}
+
 /// A function in blocks.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Cfg {
@@ -205,6 +218,8 @@ pub struct Cfg {
     pub scratch_len: u32,
     /// The leading loop.
     pub leading: Option<Box<Leading>>,
+    /// The rows of a loop that follows an array.
+    pub rows: Option<Rows>,
 }
 
 impl Cfg {
@@ -219,6 +234,7 @@ impl Cfg {
             pieces: Vec::new(),
             scratch_len: 0,
             leading: None,
+            rows: None,
         }
     }
 

@@ -47,6 +47,8 @@ impl fmt::Display for Place {
             Area::Block => write!(f, "{}", self.index)?,
             Area::Scratch => write!(f, "scratch {}", self.index)?,
             Area::Leading => write!(f, "leading {}", self.index)?,
+            Area::Inputs => write!(f, "inputs {}", self.index)?,
+            Area::Outputs => write!(f, "outputs {}", self.index)?,
         }
         if self.stride == 0 { Ok(()) } else { write!(f, " stride {}", self.stride) }
     }
@@ -261,6 +263,8 @@ fn place(line: &mut Line) -> Result<Place, String> {
     let area = match line.peek() {
         "scratch" => Area::Scratch,
         "leading" => Area::Leading,
+        "inputs" => Area::Inputs,
+        "outputs" => Area::Outputs,
         _ => Area::Block,
     };
     if area != Area::Block {

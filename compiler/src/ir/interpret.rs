@@ -166,6 +166,7 @@ impl Graph<'_> {
                             Area::Block => self.block[at].to_bits(),
                             Area::Scratch => self.scratch[at],
                             Area::Leading => unreachable!("there is no leading loop"),
+                            Area::Inputs | Area::Outputs => unreachable!("there are no rows"),
                         };
                         values.insert(*value, bits);
                     }
@@ -175,6 +176,7 @@ impl Graph<'_> {
                             Area::Block => self.block[at] = f64::from_bits(bits),
                             Area::Scratch => self.scratch[at] = bits,
                             Area::Leading => unreachable!("only the leading loop writes there"),
+                            Area::Inputs | Area::Outputs => unreachable!("there are no rows"),
                         }
                     }
                     Inst::Write(write) => {
