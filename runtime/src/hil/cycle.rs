@@ -398,7 +398,8 @@ impl Hil {
             self.stop();
         }
         let watched = self.attention.as_ref().map_or(Watched::Yes, |attention| attention.now());
-        if watched == Watched::NoLonger && !self.stage().is_idle() {
+        // Before the drives are enabled nothing but a command counts as a cause.
+        if watched == Watched::NoLonger {
             self.wires.report(Cause::Unwatched);
         }
         while let Some(said) = self.commands.next(now_ns, false) {

@@ -222,7 +222,7 @@ fn a_set_is_accepted_while_the_rig_is_stopped_or_waits() {
     assert_eq!(stand.present()[0], 0.9);
 }
 
-/// Mutants tried: armed without anybody; stopped while the drives are idle; a limit in the wrong direction.
+/// Mutants tried: armed by a command without anybody, and by itself; a limit in the wrong direction.
 #[test]
 fn a_rig_that_must_be_watched_is_armed_and_runs_only_while_it_is() {
     let attention = Attention::new(Duration::from_secs(2));
