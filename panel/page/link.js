@@ -3,7 +3,8 @@ import { words } from './words.js';
 
 /**
  * A curve as points; x in s or in the unit of its signal. One in columns says which: `cycles` of each, the `first` one.
- * @typedef {{ view: number, curve: number, x: Float64Array, y: Float64Array, cycles?: number, first?: number }} Curve
+ * `store` holds the numbers of one that grows, from place `at` on, with room for more.
+ * @typedef {{ view: number, curve: number, x: Float64Array, y: Float64Array, cycles?: number, first?: number, store?: { x: Float64Array, y: Float64Array, at: number } }} Curve
  */
 
 /**
@@ -17,13 +18,18 @@ export function joined(old, fresh, from) {
   const end = Math.min(2 * (fresh.first - old.first), old.x.length);
   let begin = 0;
   while (begin + 2 < end && old.x[begin + 2] < from) begin += 2;
-  const both = (/** @type {Float64Array} */ a, /** @type {Float64Array} */ b) => {
-    const out = new Float64Array(end - begin + b.length);
-    out.set(a.subarray(begin, end));
-    out.set(b, end - begin);
-    return out;
-  };
-  return { ...fresh, first: old.first + begin / 2, x: both(old.x, fresh.x), y: both(old.y, fresh.y) };
+  const length = end - begin + fresh.x.length;
+  let { store } = old, at = store ? store.at + begin : 0;
+  if (!store || store.at + end + fresh.x.length > store.x.length) {
+    store = { x: new Float64Array(2 * length + 64), y: new Float64Array(2 * length + 64), at: 0 };
+    store.x.set(old.x.subarray(begin, end));
+    store.y.set(old.y.subarray(begin, end));
+    at = 0;
+  }
+  store.x.set(fresh.x, at + end - begin);
+  store.y.set(fresh.y, at + end - begin);
+  const [x, y] = [store.x, store.y].map(all => all.subarray(at, at + length));
+  return { ...fresh, first: old.first + begin / 2, x, y, store: { ...store, at } };
 }
 
 /** Reads a frame. @param {ArrayBuffer} buffer @param {number} period @returns {{ number: number, newest: number, curves: Curve[] }} */

@@ -10,6 +10,8 @@ const LAST = 20;
 const BEHIND = 0.25;
 /** Least time between two pictures of what moves, ms: the browser then takes the next of its own. */
 const EACH = 12;
+/** Least time between two texts of the values of what moves, ms. */
+const NAMED = 200;
 
 const element = (/** @type {string} */ id) => /** @type {HTMLElement} */ (document.getElementById(id));
 const input = (/** @type {string} */ id) => /** @type {HTMLInputElement} */ (document.getElementById(id));
@@ -664,6 +666,10 @@ function picture(one) {
   lines.sort((a, b) => Number(b.ghost) - Number(a.ghost));
   plot.draw(lines, plot.plane ? null : span(), !plot.plane && !!newest && !!state.grows && !printing);
   if (!plot.plane) plot.drawMarks(pointer, state.events ?? [], [...cursorTimes() ?? [], ...trigger?.at ? [trigger.at] : []]);
+  // Nobody reads numbers faster, and each new text is a new layout.
+  const now = performance.now();
+  if (newest && state.grows && pointer === null && now - plot.named < NAMED) return;
+  plot.named = now;
   for (const item of plot.names.children) {
     const own = /** @type {HTMLElement} */ (item), curve = one.curves.get(Number(own.dataset.curve)), value = own.querySelector('b');
     if (!curve || !value) continue;

@@ -99,6 +99,8 @@ export class Plot {
     /** What the moving picture shows: its last pixel, counted from time 0, and all on which the others depend. @type {{ n: number, key: string } | null} */
     this.moved = null;
     this.title = '';
+    /** When its values were written last, ms. */
+    this.named = 0;
   }
 
   /** Fits the canvases to their place in device pixels. @returns {boolean} whether that changed something */

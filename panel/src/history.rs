@@ -131,17 +131,31 @@ impl History {
     /// The extremes of a signal in columns of `width` cycles, in the order of time: the pair of column `first`, and of
     /// those after it. Columns count from cycle 0, so that they are the same at every offset of a window.
     pub fn columns(&self, signal: usize, first: u64, count: usize, width: u64) -> Vec<(f64, f64)> {
+        // Columns rise, and so do the chunks in which they begin.
+        let mut place = self.chunk_of(first * width);
         let column = |i: usize| {
             let begin = (first + i as u64) * width;
-            self.extremes(signal, begin..begin + width).pair()
+            while self.chunks.get(place).is_some_and(|chunk| (chunk.index + 1) * CHUNK as u64 <= begin) {
+                place += 1;
+            }
+            self.extremes_from(place, signal, begin..begin + width).pair()
         };
         (0..count).map(column).collect()
     }
 
+    /// The place of the first chunk that ends after a cycle.
+    fn chunk_of(&self, cycle: u64) -> usize {
+        self.chunks.partition_point(|chunk| (chunk.index + 1) * CHUNK as u64 <= cycle)
+    }
+
     fn extremes(&self, signal: usize, window: Range<u64>) -> Extremes {
-        let begin = self.chunks.partition_point(|chunk| (chunk.index + 1) * CHUNK as u64 <= window.start);
+        self.extremes_from(self.chunk_of(window.start), signal, window)
+    }
+
+    /// Of a window whose first chunk is at this place.
+    fn extremes_from(&self, begin: usize, signal: usize, window: Range<u64>) -> Extremes {
         let mut found = Extremes::NONE;
-        for chunk in self.chunks.iter().skip(begin) {
+        for chunk in self.chunks.range(begin.min(self.chunks.len())..) {
             let start = chunk.index * CHUNK as u64;
             if start >= window.end {
                 break;

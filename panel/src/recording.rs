@@ -9,7 +9,7 @@ use crate::line::{View, Window};
 use crate::sheet::{Sheet, Signal};
 use crate::subject::{Page, Subject};
 use crate::thin;
-use crate::twin::{Ahead, Difference, Short, State, Twin};
+use crate::twin::{Ahead, COARSE, Difference, Short, State, Twin};
 use crate::words::clean;
 use abi::format;
 use abi::rig::{Rig, SignalKind};
@@ -629,10 +629,12 @@ impl Recording {
                 if curve.is_empty() || last < from || first > to + self.seconds(curve.len() as u64) {
                     continue;
                 }
-                let points: Vec<(f64, f64)> =
-                    curve.iter().zip(one.at + 1..).map(|(y, k)| (self.seconds(k), *y)).collect();
                 let part = ((last - first) / (to - from) * columns as f64).ceil().clamp(2.0, 1e4) as usize;
-                out.extend(thin::window(&points, first, last, part));
+                if part <= COARSE {
+                    out.extend_from_slice(&one.coarse[*signal as usize]);
+                } else {
+                    out.extend(one.points(*signal as usize, self.seconds(1), part));
+                }
                 out.push((last, f64::NAN));
             }
             let first = out.first().map_or(0.0, |point| point.0);

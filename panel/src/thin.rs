@@ -12,11 +12,16 @@ pub fn window(points: &[(f64, f64)], from: f64, to: f64, columns: usize) -> Vec<
     if inside.len() <= 4 * columns || to.partial_cmp(&from) != Some(std::cmp::Ordering::Greater) {
         return inside.to_vec();
     }
-    let column = |x: f64| ((x - from) / (to - from) * columns as f64).floor();
+    // Before the window, in it by columns.
+    let column = |x: f64| {
+        let place = (x - from) / (to - from) * columns as f64;
+        if place < 0.0 { -1 } else { place as i64 }
+    };
     let mut out: Vec<(f64, f64)> = Vec::with_capacity(4 * columns);
     let mut rest = inside;
     while let Some(first) = rest.first() {
-        let n = rest.partition_point(|point| column(point.0) <= column(first.0)).max(1);
+        let own = column(first.0);
+        let n = rest.partition_point(|point| column(point.0) <= own).max(1);
         let (these, others) = rest.split_at(n);
         let by_value = |a: &usize, b: &usize| these[*a].1.total_cmp(&these[*b].1);
         let least = (0..n).min_by(by_value).unwrap_or(0);

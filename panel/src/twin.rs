@@ -6,6 +6,7 @@
 //! program starts as it does on the rig, and the plant at its own start. The short ones start from the true state, and the
 //! plant from what the drives measured; each lasts until the next state is due. Sets after the begin are not repeated.
 
+use crate::thin;
 use abi::plan::{Experiment, PARTS, Plot, Solver, View};
 use abi::rig::{Bench, Rig, Signal};
 use abi::series::Method;
@@ -95,7 +96,12 @@ pub struct Ahead {
     pub at: u64,
     /// For each recorded quantity its values after each of the following cycles, in its unit.
     pub curves: Vec<Vec<f64>>,
+    /// For each the points (s, value) of a picture of [`COARSE`] columns: what pages get as long as that is enough.
+    pub coarse: Vec<Vec<(f64, f64)>>,
 }
+
+/// Columns of the pictures of short runs: a second of a window of 20 s has 60.
+pub const COARSE: usize = 64;
 
 impl Ahead {
     /// Makes it, for this many cycles; shorter where a program cannot continue.
@@ -108,7 +114,18 @@ impl Ahead {
                 curve.push(series.unit.from_si(control.get(series.slot)));
             }
         });
-        Ahead { at: from.at, curves }
+        let mut made = Ahead { at: from.at, curves, coarse: Vec::new() };
+        let period = rig.period_ns as f64 * 1e-9;
+        made.coarse = (0..made.curves.len()).map(|curve| made.points(curve, period, COARSE)).collect();
+        made
+    }
+
+    /// The points (s, value) of one of its curves, thinned to a picture of this many columns. `period`: of the cycle, s.
+    pub fn points(&self, curve: usize, period: f64, columns: usize) -> Vec<(f64, f64)> {
+        let at = |cycle: u64| cycle as f64 * period;
+        let points = self.curves[curve].iter().zip(self.at + 1..).map(|(y, k)| (at(k), *y));
+        let points: Vec<(f64, f64)> = points.collect();
+        thin::window(&points, at(self.at + 1), at(self.at + points.len() as u64), columns)
     }
 
     /// Root of the mean square of its difference from a recording, for one of its curves. `value`: of a cycle.
