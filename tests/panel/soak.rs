@@ -74,7 +74,7 @@ fn memory_is_flat_before_ten_viewers_of_which_one_is_deaf() {
     let signals = page.value("document.querySelectorAll('.names li').length").as_u64().unwrap();
     assert!(signals >= 40, "{signals} curves");
     page.value(
-        "(() => { const c = document.querySelector('.plot canvas').getContext('2d'), clear = c.clearRect.bind(c); \
+        "(() => { const c = document.querySelector('.stack canvas').getContext('2d'), clear = c.clearRect.bind(c); \
          window.drawn = 0; c.clearRect = (...all) => { window.drawn++; clear(...all); }; })()",
     );
     let views: Vec<String> =
@@ -111,6 +111,15 @@ fn memory_is_flat_before_ten_viewers_of_which_one_is_deaf() {
     std::thread::sleep(Duration::from_secs_f64(0.5 * seconds.min(60.0)));
     let (begun, first) = (Instant::now(), (heap(), of_process(panel.child.id()), of_process(rig.0.id())));
     let spent = of_tree(browser().pid());
+    page.call("Performance.enable", json!({}));
+    let tasks = || {
+        let all = page.call("Performance.getMetrics", json!({}))["metrics"].clone();
+        ["ScriptDuration", "LayoutDuration", "RecalcStyleDuration", "TaskDuration"].map(|name| {
+            let found = all.as_array().unwrap().iter().find(|one| one["name"] == name);
+            found.and_then(|one| one["value"].as_f64()).unwrap_or(f64::NAN)
+        })
+    };
+    let before = tasks();
     let drawn = page.value("window.drawn").as_f64().unwrap();
     let (mut least, mut most) = (f64::INFINITY, 0.0_f64);
     while begun.elapsed().as_secs_f64() < 0.5 * seconds + 0.5 * (seconds - 60.0).max(0.0) {
@@ -120,6 +129,7 @@ fn memory_is_flat_before_ten_viewers_of_which_one_is_deaf() {
     }
     let elapsed = begun.elapsed().as_secs_f64();
     let spent = of_tree(browser().pid()) - spent;
+    let after = tasks();
     let last = (heap(), of_process(panel.child.id()), of_process(rig.0.id()));
     let drawn = (page.value("window.drawn").as_f64().unwrap() - drawn) / elapsed;
     println!(
@@ -136,6 +146,14 @@ fn memory_is_flat_before_ten_viewers_of_which_one_is_deaf() {
         100.0 * (last.2.1 - first.2.1) / elapsed,
         1e3 * spent / (drawn * elapsed),
         frames.load(Ordering::Relaxed) as f64 / 8.0 / elapsed,
+    );
+    let each = |i: usize| 1e3 * (after[i] - before[i]) / (drawn * elapsed);
+    println!(
+        "a picture: {:.1} ms of script, {:.1} of layout, {:.1} of style, {:.1} of all tasks of the page's thread",
+        each(0),
+        each(1),
+        each(2),
+        each(3)
     );
     // What fills up does so before; what leaks a frame for each picture would be much larger.
     assert!(last.0 < first.0 + 1e6, "the page's heap grows from {} to {}", first.0, last.0);
