@@ -22,6 +22,7 @@ use crate::ir::build::Build;
 use crate::ir::variance::{self, Variance};
 use crate::ir::{Func, Op, Value, is_not_negative, sign_of};
 use crate::opt::reassociate::carried;
+use crate::opt::twins::Twins;
 use abi::Layout;
 
 /// Fuses every product that may be fused. `layout`: the block that the function works on.
@@ -42,7 +43,12 @@ pub fn contract(func: &Func, layout: &Layout) -> Func {
     let cannot_cancel = |x: Value, y: Value| [x, y].iter().all(|part| is_not_negative(*part, |value| func.op(value)));
     let is_sign = |value: Value| sign_of(func.op(value), |value| func.op(value)).is_some();
     let is_exact = |value: Value| matches!(func.op(value), Op::Mul(a, b) if is_sign(a) || is_sign(b));
+    let mut twins = Twins::of(func);
     for (sum, op) in func.ops.iter().enumerate() {
+        if let Some(twin) = twins.copy(&values, &mut build) {
+            values.push(twin);
+            continue;
+        }
         let at = |value: Value| values[value.index()];
         let is_early = |x: Value, y: Value| product(x).is_some() && !cancels(y) && chain.is_early_addend(x, y, sum);
         let value = match *op {

@@ -9,6 +9,7 @@ pub mod reassociate;
 pub mod contract;
 pub mod limiter_tests;
 pub mod guard_reduction;
+mod twins;
 
 use crate::ir::Func;
 use crate::ir::program::Program;

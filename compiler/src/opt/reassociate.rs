@@ -20,6 +20,7 @@
 use crate::ir::build::Build;
 use crate::ir::hash::HashSet;
 use crate::ir::{Func, Op, Value};
+use crate::opt::twins::Twins;
 use abi::Slot;
 
 /// When a value is ready, in processor cycles after the start of an iteration. `None`: the value is loop-invariant.
@@ -36,10 +37,10 @@ const MIN_GAIN: i32 = 6;
 /// contact at rest needs; sums are then not split.
 pub fn reassociate(func: &Func, balanced: bool) -> Func {
     let carried = carried(func);
-    let after = after(func, &carried);
+    let (after, twins) = (after(func, &carried), Twins::of(func));
     // The first pass regroups every chain and finds the shortest critical path; the second regroups only longer chains.
-    let (_, shortest) = rebuild(func, Pass::new(func, &carried, balanced), &after, 0);
-    rebuild(func, Pass::new(func, &carried, balanced), &after, shortest).0
+    let (_, shortest) = rebuild(func, Pass::new(func, &carried, balanced), &after, twins.clone(), 0);
+    rebuild(func, Pass::new(func, &carried, balanced), &after, twins, shortest).0
 }
 
 /// The loop-carried slots: an iteration loads what the previous one stored. Time and the step count are excluded,
@@ -52,9 +53,14 @@ pub(super) fn carried(func: &Func) -> HashSet<Slot> {
 
 /// Rebuilds the function, regroups the chains longer than `critical_path` cycles, and returns it with its own critical
 /// path, in cycles.
-fn rebuild(func: &Func, mut pass: Pass, after: &[Ready], critical_path: i32) -> (Func, i32) {
+fn rebuild(func: &Func, mut pass: Pass, after: &[Ready], mut twins: Twins, critical_path: i32) -> (Func, i32) {
     let mut values: Vec<Value> = Vec::with_capacity(func.ops.len());
     for (op, after) in func.ops.iter().zip(after) {
+        if let Some(twin) = twins.copy(&values, &mut pass.build) {
+            pass.record_ready();
+            values.push(twin);
+            continue;
+        }
         let op = op.map(|operand| values[operand.index()]);
         let plain = pass.op(op);
         let long = after.zip(pass.ready_at(plain)).is_some_and(|(after, ready)| ready + after > critical_path);
