@@ -1211,3 +1211,35 @@ fn a_joint_sweep_names_all_its_quantities() {
     folder.check(&["run", "k.fric", "swept", "--out", "o"], 0, "k, c = 2 N/m");
     assert_eq!(folder.names("o"), ["swept-k-c-1-N-m.csv", "swept-k-c-2-N-m.csv", "swept.svg"]);
 }
+
+/// What a user's file declares hides what the library has; two files of the user do not hide each other.
+#[test]
+fn an_imported_file_hides_the_library() {
+    let model = |force: &str| format!("model Controller {{ input e [m] output u [N] = {force} * e }}\n");
+    let uses = "model Use { input e [m] part c = Controller(e = e) output u [N] = c.u }\n\
+                experiment run { run Use(e = 1 m) for 1 s expect final(u) ~= 3 N +- 1 uN }\n";
+    let folder = Folder::new("hides")
+        .with("mine.fric", model("3 N/m"))
+        .with("other.fric", model("4 N/m"))
+        .with("a.fric", format!("import std.interfaces\nimport \"mine.fric\"\n{uses}"))
+        .with("b.fric", format!("import \"mine.fric\"\nimport std.interfaces\n{uses}"))
+        .with("c.fric", format!("import \"mine.fric\"\nimport \"other.fric\"\n{uses}"));
+    folder.check(&["test", "a.fric", "b.fric"], 0, "2 passed, 0 failed");
+    folder.check(&["check", "c.fric"], 1, "E0202");
+}
+
+/// A run that leaves a range only because its fixed steps are too long says so; one that leaves it anyway does not.
+#[test]
+fn a_step_that_is_too_long_is_named() {
+    let text = "model Relaxes {\n  input u [m]\n  param T = 1 ms in > 0\n  state x [m] = -1 m in -1 m .. 1 m\n  dx/dt = (u - x) / T\n}\n\
+                experiment steps { run Relaxes(u = 0.9 m) for 1 s solver euler step 1.9 ms plot x }\n\
+                experiment far { run Relaxes(u = 2 m * t / 1 s) for 1 s solver rk4 step 1 ms plot x }\n";
+    let folder = Folder::new("too-long").with("x.fric", text);
+    folder.check(
+        &["run", "x.fric", "steps", "-q"],
+        1,
+        "by adaptive steps it does not: steps of 0.0019 s by euler are too long",
+    );
+    let (_, far) = folder.check(&["run", "x.fric", "far", "-q"], 1, "left its range");
+    assert!(!far.contains("adaptive"), "{far}");
+}

@@ -310,10 +310,10 @@ fn too_long(loaded: &mut Loaded, name: &str, options: &Options, case: &Case, fai
         looks += 1;
         if looks > MOST_LOOKS { Continue::Break(()) } else { Continue::Continue(()) }
     };
-    // Beyond the time of the failure the two need not agree.
+    // An adaptive run looks at ranges where its own steps end, which may be much later.
     let passed = match engine::run(other.instance, &other.experiment, &mut watch) {
         Ok(_) => true,
-        Err(other) => other.time > 1.01 * failure.time,
+        Err(other) => other.time > 2.0 * failure.time,
     };
     let step = abi::format::time(solver.step);
     passed.then(|| format!("; by adaptive steps it does not: steps of {step} by {} are too long", solver.method.name()))

@@ -353,7 +353,10 @@ impl<'a> Flattener<'a> {
                     .label(head.name.span, "not declared");
                 let error = match nearest(&head.name.text, visible) {
                     Some(near) => error.help(format!("did you mean `{near}`?")),
-                    None => error.help("constants, functions and `t` can be used here"),
+                    None => error.help(format!(
+                        "constants, functions and `t` can be used here; what `sweep` or `--set` changes is a `param` of a model\naround it: `model Driven {{ param {} = …  part bench = … }}`, and `run Driven()`",
+                        head.name.text
+                    )),
                 };
                 self.report(error);
             }
