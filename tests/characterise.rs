@@ -148,6 +148,58 @@ fn elements_with_yield_surfaces_are_characterised() {
     assert_eq!(seen["notes"].as_array().unwrap().len(), 0, "{}", seen["notes"]);
 }
 
+/// What `check`, `explain`, `characterise` and its LaTeX say of dissipation agree. LuGre with its stored energy is passive
+/// for σ2 ≥ σ1 (Fs − Fc)/Fc and not otherwise (Barahanov, Ortega 2000); without a `storage` nothing is proved.
+#[test]
+fn all_commands_agree_on_dissipation() {
+    let folder = folder("dissipation");
+    let seed = std::env::var("FRIC_SEED").ok().and_then(|seed| seed.parse().ok()).unwrap_or(2);
+    let mut random = compiler::ir::random::Random(seed);
+    let (mut text, mut expected) = (String::new(), Vec::new());
+    for case in 0..6 {
+        let (fc, excess) = (random.within(0.5, 20.0), random.within(0.1, 1.0));
+        let (sigma0, sigma1) = (fc / random.within(5e-6, 5e-5), random.within(50.0, 500.0));
+        let needed = sigma1 * excess;
+        let (times, storage) = [(2.0, true), (0.2, true), (2.0, false)][case % 3];
+        expected.push(if storage { Some(times > 1.0) } else { None });
+        text += &format!(
+            "model M{case} {{\n  input v [m/s]\n  param sigma0 = {sigma0} N/m in > 0\n  param Fc = {fc} N in > 0\n  \
+             param Fs = {} N in > 0\n  require Fs >= Fc\n  let g = Fc + (Fs - Fc) * exp(-(v / 1 mm/s)^2)\n  \
+             state z [um] = 0 in -Fs / sigma0 .. Fs / sigma0\n  dz/dt = v - sigma0 * abs(v) / g * z\n  \
+             output F [N] = sigma0 * z + {sigma1} N·s/m * dz/dt + {} N·s/m * v\n{}}}\n",
+            fc * (1.0 + excess),
+            times * needed,
+            if storage { "  storage 0.5 * sigma0 * z^2\n" } else { "" }
+        );
+    }
+    fs::write(folder.join("m.fric"), text).unwrap();
+    let command = |args: &[&str]| {
+        let output = Command::new(env!("CARGO_BIN_EXE_fric")).args(args).current_dir(&folder).output().unwrap();
+        String::from_utf8(output.stdout).unwrap()
+    };
+    let warnings: Value = serde_json::from_str(&command(&["check", "m.fric", "--json"])).unwrap();
+    for (case, passive) in expected.into_iter().enumerate() {
+        let name = format!("M{case}");
+        let explained: Value = serde_json::from_str(&command(&["explain", "m.fric", &name, "--json"])).unwrap();
+        let words = explained["dissipation"].as_str().unwrap().to_string();
+        let seen: Value =
+            serde_json::from_str(&fric(&folder, &["characterise", "m.fric", &name, "--json", "--out", &name])).unwrap();
+        let row = seen["phenomena"].as_array().unwrap().iter().find(|row| row["key"] == "dissipative").unwrap().clone();
+        let tex = fs::read_to_string(folder.join(&name).join("report.tex")).unwrap();
+        let mark = tex.lines().find(|line| line.starts_with("dissipative & ")).unwrap().to_string();
+        let told = format!("seed {seed}, {name}: {words}; {row}; {mark}");
+        assert!(row["why"].as_str().unwrap().starts_with(&words), "{told}");
+        let (begin, verdict, sign) = match (passive, words.starts_with("proved")) {
+            (Some(false), _) => ("fails", "not-shown", "\\times"),
+            (Some(true), true) => ("proved", "shown", "\\checkmark"),
+            (Some(true) | None, _) => ("not proven", "not-proven", "\\circ"),
+        };
+        assert!(words.starts_with(begin) && row["seen"] == verdict && mark.contains(sign), "{told}");
+    }
+    let pushing = warnings.as_array().unwrap().iter().filter(|one| one["code"] == "W0703").count();
+    assert_eq!(pushing, 2, "{warnings}");
+}
+
 /// A family over an input; the report of one lists what was held.
 #[test]
 fn a_family_goes_over_an_input() {
@@ -163,6 +215,20 @@ fn a_family_goes_over_an_input() {
         .map(|line| serde_json::from_str::<Value>(line).unwrap()["scales"]["break_away_force"].as_f64().unwrap())
         .collect();
     assert!((forces[0] - 1.5).abs() < 0.01 && (forces[1] - 6.0).abs() < 0.03, "{forces:?}");
+    // One bench for members whose forces differ forty-fold: mass, pull speeds and force rates, and the page says so.
+    let over = ["characterise", "LoadedLuGre", "--over", "Fn = 1 N, 7 N, 40 N", "--json", "--out", "loads"];
+    let members: Vec<Value> =
+        fric(&folder, &over).lines().map(|line| serde_json::from_str::<Value>(line).unwrap()).collect();
+    let bench = |seen: &Value| {
+        let rates =
+            seen["tests"][1]["numbers"].as_array().unwrap().iter().map(|n| n["name"].as_str().unwrap().to_string());
+        let pulls = ["slowest_pull", "fastest_pull"].map(|key| number(seen, "stick_slip", key));
+        (seen["scales"]["mass"].as_f64().unwrap(), pulls, rates.collect::<Vec<_>>(), seen["bench"].clone())
+    };
+    assert!(members.len() == 3 && members.iter().all(|one| bench(one) == bench(&members[0])), "{members:?}");
+    assert!(members.iter().all(|one| verdicts(one, &["stick_slip"]) == "+"), "{members:?}");
+    let page = fs::read_to_string(folder.join("loads/compare.html")).unwrap();
+    assert!(page.contains("One bench for all: mass 10 kg"));
     assert_self_contained(&fs::read_to_string(folder.join("out/Loaded/compare.html")).unwrap());
 }
 
@@ -243,6 +309,12 @@ fn a_model_that_cannot_be_characterised_is_refused_with_a_reason() {
     assert!(refused(&["characterise", "LuGree"]).contains("did you mean `LuGre`?"));
     assert!(refused(&["characterise", "mine.fric", "Spring"]).contains("no friction model"));
     assert!(refused(&["characterise", "absent.fric"]).contains("there is no such file"));
+    // What `fric check` refuses is not run.
+    let unsafe_text =
+        "model Mine {\n  input v [m/s]\n  param vs = 1 mm/s\n  output F [N] = 1 N * v / (abs(v) + vs)\n}\n";
+    fs::write(folder.join("unsafe.fric"), unsafe_text).unwrap();
+    assert!(refused(&["characterise", "unsafe.fric"]).contains("E0601"));
+    assert!(refused(&["compare", "Dahl", "unsafe.fric"]).contains("E0601"));
 }
 
 #[test]

@@ -1,10 +1,10 @@
 //! `fric characterise` and `fric compare`: run friction models through the standard battery.
 
-use super::End;
+use super::{End, load, sound};
 use crate::args::{Characterise, Compare, Figures};
 use crate::characterise::subject::{self, Origin, Subject, Written};
 use crate::characterise::{Extent, Seen, Study, family as study_of_family, latex, page, shown, study};
-use crate::compile::{self, Changes, Loaded, Options};
+use crate::compile::{self, Changes, Loaded, Options, Stopwatch};
 use crate::terminal::{Style, Terminal};
 use crate::vary::{How, Vary};
 use crate::{project, report};
@@ -15,6 +15,9 @@ pub fn characterise(args: &Characterise, terminal: &mut Terminal) -> End {
     if let Some(why) = args.figures.look.unused(args.figures.figures.is_some(), "--figures pdf") {
         terminal.error(&why);
         return End::Misused;
+    }
+    if !is_sound(&args.what, args.json, terminal) {
+        return End::Failed;
     }
     let found = match subjects(&args.what, &args.models, &args.set, args.out.as_deref()) {
         Ok(found) => found,
@@ -100,6 +103,9 @@ pub fn compare(args: &Compare, terminal: &mut Terminal) -> End {
     let mut studies: Vec<Study> = Vec::new();
     let mut end = End::Fine;
     for what in &args.models {
+        if !is_sound(what, args.json, terminal) {
+            return End::Failed;
+        }
         let found = match subjects(what, &[], &[], Some(&folder)) {
             Ok(found) => found,
             Err(why) => return failed(terminal, &why),
@@ -176,6 +182,16 @@ fn failed(terminal: &Terminal, why: &str) -> End {
 
 fn battery_in(folder: &Path) -> String {
     folder.join("battery.fric").display().to_string()
+}
+
+/// Whether a file has no errors of `fric check`: what it refuses is not run. Reports them.
+fn is_sound(what: &str, quiet: bool, terminal: &Terminal) -> bool {
+    if !what.ends_with(".fric") {
+        return true;
+    }
+    let mut watch = Stopwatch::start("read");
+    let loaded = load(Path::new(what), terminal, &mut watch);
+    loaded.is_some_and(|loaded| sound(&loaded, quiet, terminal, &mut watch).is_ok())
 }
 
 /// The requested models, each with the folder for its report.
