@@ -771,7 +771,7 @@ pub mod strict {
                             "\\" if columns.is_some() => (cells, scripts) = (1, (false, false)),
                             command => {
                                 let known: &[&str] = if mode == Mode::Math { &IN_MATH } else { &IN_TEXT };
-                                if !known.contains(&command) && !(mode == Mode::Text && command == "}") {
+                                if !(known.contains(&command) || mode == Mode::Text && command == "}") {
                                     return Err(self.wrong("an unknown command"));
                                 }
                                 if WITH_ARGUMENT.contains(&command) {

@@ -476,6 +476,9 @@ mod tests {
         std::env::var("FRIC_SEED").ok().and_then(|seed| seed.parse().ok()).unwrap_or(29)
     }
 
+    /// Loss of a loop between ±a, and its part of the box.
+    type Form = Box<dyn Fn(f64) -> (f64, f64)>;
+
     /// Loss of the presliding loop between ±a, and its part of the box, against closed forms. Of Dahl, with α = a/Fc and
     /// L = ln((1 + α)/(1 − α)): 2 Fc²/σ (L − 2α), 1/α − 2/L. Of elements with a virgin curve f(x) (Masing): 8 ∫f dx −
     /// 4 X a, where f(X) = a. Of one element below its yield: 0. Of LuGre, moved slowly: as Dahl with Fs.
@@ -488,11 +491,11 @@ mod tests {
             let fc = (10.0_f64.powf(random.within(-1.0, 2.5)) * 100.0).round() / 100.0;
             let travel = 10.0_f64.powf(random.within(-6.0, -3.5));
             let k = (fc / travel).round();
-            let dahl = |a: f64, fc: f64| {
+            let dahl = move |a: f64, fc: f64| {
                 let (alpha, log) = (a / fc, ((1.0 + a / fc) / (1.0 - a / fc)).ln());
                 (2.0 * fc * fc / k * (log - 2.0 * alpha), 1.0 / alpha - 2.0 / log)
             };
-            let (model, form): (String, Box<dyn Fn(f64) -> (f64, f64)>) = match case % 4 {
+            let (model, form): (String, Form) = match case % 4 {
                 0 => (format!("Dahl(sigma = {k} N/m, Fc = {fc} N)"), Box::new(move |a| dahl(a, fc))),
                 1 => (format!("MaxwellElement(k = {k} N/m, W = {fc} N)"), Box::new(|_| (0.0, 0.0))),
                 2 => {
