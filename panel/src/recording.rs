@@ -37,7 +37,7 @@ const PATH_POINTS: u64 = 60_000;
 const HEAVY: f64 = 0.9;
 
 /// Short runs of the model that are kept, and states from which one waits to be made: the newest.
-const AHEAD: usize = 60;
+const AHEAD: usize = 30;
 
 /// Interval at which counts and the histogram are shown anew while more comes.
 const TELL: Duration = Duration::from_millis(500);
@@ -630,7 +630,7 @@ impl Recording {
                     continue;
                 }
                 let part = ((last - first) / (to - from) * columns as f64).ceil().clamp(2.0, 1e4) as usize;
-                if part <= COARSE {
+                if part <= 4 * COARSE {
                     out.extend_from_slice(&one.coarse[*signal as usize]);
                 } else {
                     out.extend(one.points(*signal as usize, self.seconds(1), part));

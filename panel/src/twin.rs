@@ -100,8 +100,8 @@ pub struct Ahead {
     pub coarse: Vec<Vec<(f64, f64)>>,
 }
 
-/// Columns of the pictures of short runs: a second of a window of 20 s has 60.
-pub const COARSE: usize = 64;
+/// Columns of the pictures of short runs, with four points each: a second of a window of 20 s has 60 pixels.
+pub const COARSE: usize = 24;
 
 impl Ahead {
     /// Makes it, for this many cycles; shorter where a program cannot continue.
