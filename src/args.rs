@@ -703,7 +703,7 @@ pub struct Hil {
     #[arg(long, requires = "panel")]
     pub no_open: bool,
     /// Others may look at the panel at this address of this computer, and stop the rig: they have a link of their own
-    #[arg(long, value_name = "ADDR:PORT", requires = "panel")]
+    #[arg(long, value_name = "ADDR:PORT", requires = "panel", value_parser = listening)]
     pub share: Option<std::net::SocketAddr>,
     /// Stop the rig if no page of the panel has been drawn for this time, such as 2s; it is armed only once one is
     #[arg(long, value_name = "TIME", requires = "panel", value_parser = dead_man)]
@@ -1038,7 +1038,7 @@ pub struct Panel {
     #[arg(long)]
     pub no_open: bool,
     /// Others may look at this address of this computer, and stop a rig: they have a link of their own
-    #[arg(long, value_name = "ADDR:PORT", conflicts_with = "save")]
+    #[arg(long, value_name = "ADDR:PORT", conflicts_with = "save", value_parser = listening)]
     pub share: Option<std::net::SocketAddr>,
     /// With USER@HOST: option for ssh, such as Port=2222
     #[arg(short = 'o', value_name = "NAME=VALUE")]
@@ -1220,6 +1220,11 @@ fn positive_time(text: &str) -> Result<f64, String> {
         dimension => return Err(format!("a time is needed, not {}", dimension.describe())),
     }
     if value > 0.0 && value.is_finite() { Ok(value) } else { Err("a time greater than 0 is needed".into()) }
+}
+
+/// An address at which others may look.
+fn listening(text: &str) -> Result<std::net::SocketAddr, String> {
+    text.parse().map_err(|_| "write an address of this computer with a port, for example 192.168.1.20:7421".into())
 }
 
 /// The time of a dead man's switch. Logs are written ten times a second, so a picture may be some tenths of a second old.

@@ -138,7 +138,7 @@ struct RunArgs {
     #[arg(long, value_name = "PORT", requires = "panel", default_value_t = ::panel::server::PORT)]
     port: u16,
     /// Others may look at the panel at this address of this computer, and stop the rig: they have a link of their own
-    #[arg(long, value_name = "ADDR:PORT", requires = "panel")]
+    #[arg(long, value_name = "ADDR:PORT", requires = "panel", value_parser = listening)]
     share: Option<SocketAddr>,
     /// Stop the rig if no page of any panel has been drawn for this time, such as 2s; it is armed only once one is
     #[arg(long, value_name = "TIME", value_parser = dead_man, conflicts_with_all = ["fast", "check"])]
@@ -157,7 +157,7 @@ struct PanelArgs {
     #[arg(long, value_name = "PORT", default_value_t = ::panel::server::PORT)]
     port: u16,
     /// Others may look at this address of this computer, and stop the rig: they have a link of their own
-    #[arg(long, value_name = "ADDR:PORT")]
+    #[arg(long, value_name = "ADDR:PORT", value_parser = listening)]
     share: Option<SocketAddr>,
     /// Curves in memory; what is older is left out
     #[arg(long, value_name = "SIZE", value_parser = parts::bytes, default_value = "256MB")]
@@ -280,6 +280,11 @@ fn seconds(text: &str) -> Result<f64, String> {
         t if unit.dimension == second.dimension && t > 0.0 && t.is_finite() => Ok(t),
         _ => Err("a time greater than 0 is needed, for example 60s".into()),
     }
+}
+
+/// An address at which others may look.
+fn listening(text: &str) -> Result<SocketAddr, String> {
+    text.parse().map_err(|_| "write an address of this computer with a port, for example 192.168.1.20:7421".into())
 }
 
 /// The time of a dead man's switch. Logs are written ten times a second, so a picture may be some tenths of a second old.

@@ -109,6 +109,10 @@ impl Company {
         if !std::mem::replace(&mut self.over, false) {
             told.say("over it was not started: its terminal says why");
         }
+        // A panel that has ended meanwhile cannot ask for another run.
+        if self.wished.try_recv() == Ok(Wish::Quit) {
+            return false;
+        }
         told.say("again");
         terminal.line("  the panel stays: Start again there, or type again or quit");
         loop {
