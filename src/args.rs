@@ -484,6 +484,8 @@ pub struct Sweep {
 pub const LEVEL: f64 = 0.95;
 /// Number of starts of a fit, if none is given.
 pub const STARTS: usize = 64;
+/// The same, if the model has regimes.
+pub const STARTS_WITH_REGIMES: usize = 256;
 
 /// `fric fit`
 #[derive(clap::Args, Debug)]
@@ -495,15 +497,16 @@ pub struct Fit {
     /// The fits in it to find the parameters of [default: all]
     #[arg(value_name = "FIT")]
     pub fits: Vec<String>,
-    /// Fit another recording with the same columns
-    #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
-    pub data: Option<PathBuf>,
+    /// Fit other recordings with the same columns
+    #[arg(long, value_name = "FILE,…", value_delimiter = ',', value_hint = ValueHint::FilePath)]
+    pub data: Vec<PathBuf>,
     /// Probability with which an interval holds the true value
     #[arg(long, value_name = "PERCENT", default_value = "95%", value_parser = level)]
     pub level: f64,
-    /// Number of starts that are judged: the one in the text, and others all over the ranges
-    #[arg(long, value_name = "N", default_value_t = STARTS, value_parser = starts)]
-    pub starts: usize,
+    /// Number of starts that are judged: the one in the text, and others all over the ranges [default: 64, or 256 if the
+    /// model has regimes]
+    #[arg(long, value_name = "N", value_parser = starts)]
+    pub starts: Option<usize>,
     /// Seed of the other starts
     #[arg(long, value_name = "N", default_value_t = 0)]
     pub seed: u64,

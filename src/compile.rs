@@ -21,7 +21,9 @@ use compiler::codegen::{c, image, jit};
 pub use compiler::experiment::of_fit::HELD;
 pub use compiler::experiment::spaced;
 pub use compiler::experiment::vary::{PreparedRun, Varying};
-pub use compiler::fit::{Asks, Fit, Item as FitItem, Unknown as FitUnknown, find as find_fit};
+pub use compiler::fit::{
+    Asks, Fit, Item as FitItem, Part as FitPart, Unknown as FitUnknown, find as find_fit, single as single_fit,
+};
 pub use compiler::frontend::columns::{Columns, Selector, read as read_columns};
 pub use compiler::frontend::names::nearest;
 pub use compiler::frontend::resolve::{Lookup, Space};

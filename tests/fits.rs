@@ -164,7 +164,8 @@ fn a_free_oscillation_gives_stiffness_and_damping() {
     }
     let chi_square = answer["chi_square"].as_f64().unwrap();
     assert!((chi_square - 1.0).abs() < 0.3, "{chi_square}");
-    assert_eq!((answer["begins"].as_f64(), answer["solver"].as_str()), (Some(3.0), Some("adaptive tol 1e-8")));
+    let recording = &answer["recordings"][0];
+    assert_eq!((recording["begins"].as_f64(), recording["solver"].as_str()), (Some(3.0), Some("adaptive tol 1e-8")));
 }
 
 const VISCOUS: &str = "model Two {\n  input v [m/s]\n  param k = 1 N·s/m  in 0.1 N·s/m .. 10 N·s/m\n  param j = 1 N·s/m  in 0.1 N·s/m .. 10 N·s/m\n  param c = 1 N  in 0 N .. 3 N\n  param idle = 1 N  in 0.1 N .. 10 N\n  allow unused \"for the test\"\n  output F [N] = (k + j) * v + c\n}\nfit f {\n  run Two(v = data.v)\n  data \"r.csv\" (t [s], v [m/s], F [N])\n";
@@ -297,7 +298,8 @@ fn steady_points_are_fitted_at_the_steady_state_in_any_order() {
         let mut rows = curve(&mut chance);
         let still = fitted("still", &of_curve("StribeckGauss", "Fv"), &rows.concat());
         let moved = fitted("bristle", &of_curve("LuGre", "sigma2"), &rows.concat());
-        assert_eq!((still["steady"].as_bool(), still["rows"].as_u64()), (Some(true), Some(40)), "seed {seed}");
+        let points = &still["recordings"][0];
+        assert_eq!((points["steady"].as_bool(), points["rows"].as_u64()), (Some(true), Some(40)), "seed {seed}");
         for k in 0..4 {
             let of = |answer: &Value, what: &str| {
                 let found = &answer["parameters"][k];
@@ -308,7 +310,7 @@ fn steady_points_are_fitted_at_the_steady_state_in_any_order() {
             assert!((of(&moved, "value") - at).abs() < 0.02 * sd, "seed {seed}: {moved}\n{still}");
             assert!((of(&moved, "sd") / sd - 1.0).abs() < 0.02, "seed {seed}: {moved}\n{still}");
         }
-        assert_eq!(still["compared"][0]["autoregression"], serde_json::json!([]));
+        assert_eq!(points["compared"][0]["autoregression"], serde_json::json!([]));
         for k in (1..rows.len()).rev() {
             rows.swap(k, (chance.fraction() * (k + 1) as f64) as usize);
         }
@@ -499,4 +501,137 @@ fn the_page_shows_what_its_commands_print() {
         }
     }
     assert!(commands >= 1, "the page has no commands");
+}
+
+/// Files beside the text, then the JSON of the fit in it.
+fn fitted_with(name: &str, text: &str, files: &[(String, String)]) -> Value {
+    let folder = folder(name);
+    fs::write(folder.join("f.fric"), text).unwrap();
+    for (file, content) in files {
+        fs::write(folder.join(file), content).unwrap();
+    }
+    let output = fric(&folder, &["fit", "f.fric", "--json"]);
+    let text = String::from_utf8_lossy(&output.stdout);
+    let message = String::from_utf8_lossy(&output.stderr);
+    serde_json::from_str(&text).unwrap_or_else(|_| panic!("{name}: {text}{message}"))
+}
+
+const OFFSET: &str = "model Slide {\n  input v [m/s]\n  param k = 1 N·s/m in 0.1 N·s/m .. 10 N·s/m\n  param c = 1 N in 0.1 N .. 10 N\n  param o = 0 N in -5 N .. 5 N\n  output F [N] = k * v + c * v / sqrt(v * v + 0.01 m^2/s^2) + o\n}\n";
+
+/// Three recordings of one contact, each with an offset of its own: k 2.5 N·s/m, c 1.2 N. Returns the offsets.
+fn slides(chance: &mut Chance) -> (Vec<(String, String)>, Vec<f64>) {
+    let offsets: Vec<f64> = (0..3).map(|_| 4.0 * chance.fraction() - 2.0).collect();
+    let file = |(k, offset): (usize, &f64)| {
+        let row = |n: u32| {
+            let (t, v) = (0.01 * f64::from(n), f64::sin(0.02 * f64::from(n) + k as f64));
+            let force = 2.5 * v + 1.2 * v / (v * v + 1e-2).sqrt() + offset;
+            (t, v, force)
+        };
+        let line = |n: u32| {
+            let (t, v, force) = row(n);
+            format!("{t},{v:e},{:e}\n", force + 0.01 * chance.normal())
+        };
+        (format!("r{k}.csv"), (0..400).map(line).collect::<String>())
+    };
+    let files = offsets.iter().enumerate().map(file).collect();
+    (files, offsets)
+}
+
+/// Several recordings determine what they share, and each its own offset, within four standard deviations. With one
+/// offset for all, none is found.
+#[test]
+fn recordings_share_unknowns_and_have_their_own() {
+    let fit = "fit f {\n  run Slide(v = data.v)\n  data \"r0.csv\", \"r1.csv\", \"r2.csv\" (t [s], v [m/s], F [N])\n  vary k, c, o each\n  minimise rms(F - data.F)\n  expect rms(F - data.F) < 20 mN\n}\n";
+    for seed in 0..5 {
+        let mut chance = Chance(seed);
+        let (files, offsets) = slides(&mut chance);
+        let answer = fitted_with("each", &format!("{OFFSET}{fit}"), &files);
+        let all = answer["parameters"].as_array().unwrap();
+        let expected: Vec<f64> = [2.5, 1.2].into_iter().chain(offsets).collect();
+        assert_eq!(all.len(), 5, "seed {seed}: {answer}");
+        for (found, expected) in all.iter().zip(&expected) {
+            let (value, sd) = (found["value"].as_f64().unwrap(), found["sd"].as_f64().unwrap());
+            assert!((value - expected).abs() < 4.0 * sd && sd < 0.01, "seed {seed}: {found}, not {expected}");
+        }
+        assert_eq!(all[4]["recording"], "r2", "seed {seed}");
+        let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).join("fits/each");
+        let output = fric(&folder, &["fit", "f.fric"]);
+        let words = String::from_utf8_lossy(&output.stdout);
+        assert!(words.contains("3 recordings, 1,200 rows") && words.contains("o of r1"), "{output:?}");
+        assert!(words.contains("out/f_r0.csv"), "{words}");
+        let tested = fric(&folder, &["test", "out/f.fric"]);
+        assert!(tested.status.success(), "seed {seed}: {tested:?}");
+        let formatted = fric(&folder, &["fmt", "--check", "out/f.fric"]);
+        assert!(formatted.status.success(), "seed {seed}: {formatted:?}");
+    }
+}
+
+/// Cases with one recording each, whose unknowns are those of the fit itself, are the same question as a list of the
+/// recordings: the same numbers, to the bit.
+#[test]
+fn cases_and_a_list_of_recordings_ask_the_same() {
+    let list = "fit f {\n  run Slide(v = data.v, o = 0.5 N)\n  data \"r0.csv\", \"r1.csv\" (t [s], v [m/s], F [N])\n  vary k in 0.1 N·s/m .. 10 N·s/m, c in 0.1 N .. 10 N\n  minimise rms(F - data.F)\n}\n";
+    let case = |k: u32| {
+        format!(
+            "  case c{k} {{\n    run Slide(v = data.v, o = 0.5 N, k = damping, c = force)\n    data \"r{k}.csv\" (t [s], v [m/s], F [N])\n    minimise rms(F - data.F)\n  }}\n"
+        )
+    };
+    let cases = format!(
+        "fit f {{\n  vary damping = 1 N·s/m in 0.1 N·s/m .. 10 N·s/m, force = 1 N in 0.1 N .. 10 N\n{}{}}}\n",
+        case(0),
+        case(1)
+    );
+    for seed in 0..3 {
+        let (files, _) = slides(&mut Chance(seed));
+        let list = fitted_with("list", &format!("{OFFSET}{list}"), &files);
+        let cases = fitted_with("cases", &format!("{OFFSET}{cases}"), &files);
+        for k in 0..2 {
+            for what in ["value", "sd", "interval"] {
+                assert_eq!(list["parameters"][k][what], cases["parameters"][k][what], "seed {seed}: {what}");
+            }
+        }
+        assert_eq!(cases["recordings"][1]["label"], "c1", "seed {seed}");
+        let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).join("fits/cases");
+        let output = fric(&folder, &["fit", "f.fric"]);
+        assert!(output.status.success(), "{output:?}");
+        let tested = fric(&folder, &["test", "out/f.fric"]);
+        assert!(tested.status.success(), "seed {seed}: {tested:?}");
+        let refused = fric(&folder, &["fit", "f.fric", "--data", "r0.csv"]);
+        assert_eq!(refused.status.code(), Some(2), "{refused:?}");
+    }
+}
+
+/// The initial position of each of two recordings of an oscillator is found with its stiffness. With initial values as
+/// written the oscillator rests.
+#[test]
+fn initial_values_are_unknowns() {
+    let text = "model Oscillator {\n  param k = 3 N/m in 0.1 N/m .. 100 N/m\n  state x [m] = 0\n  state v [m/s] = 0\n  dx/dt = v\n  dv/dt = -(k * x + 0.3 N·s/m * v) / 1 kg\n}\nfit f {\n  run Oscillator()\n  data \"r0.csv\", \"r1.csv\" (t [s], x [mm])\n  vary k in 1 N/m .. 10 N/m, initial(x) in -0.5 m .. 0.5 m each\n  minimise rms(x - data.x)\n}\n";
+    for seed in 0..3 {
+        let mut chance = Chance(seed);
+        let (k, d) = (4.0, 0.3);
+        let omega = f64::sqrt(k - 0.25 * d * d);
+        let starts: Vec<f64> =
+            (0..2).map(|_| (0.1 + 0.3 * chance.fraction()).copysign(chance.fraction() - 0.5)).collect();
+        let file = |(n, x0): (usize, &f64)| {
+            let x = |t: f64| x0 * (-0.5 * d * t).exp() * ((omega * t).cos() + 0.5 * d / omega * (omega * t).sin());
+            let line = |row: u32| {
+                let t = 0.05 * f64::from(row);
+                format!("{t},{:e}\n", 1e3 * x(t) + chance.normal())
+            };
+            (format!("r{n}.csv"), (0..200).map(line).collect::<String>())
+        };
+        let files: Vec<(String, String)> = starts.iter().enumerate().map(file).collect();
+        let answer = fitted_with("initial", text, &files);
+        let all = answer["parameters"].as_array().unwrap();
+        for (found, expected) in all.iter().zip([k, starts[0], starts[1]]) {
+            let scale = if found["unit"] == "mm" { 1e-3 } else { 1.0 };
+            let (value, sd) = (scale * found["value"].as_f64().unwrap(), scale * found["sd"].as_f64().unwrap());
+            assert!((value - expected).abs() < 4.0 * sd && sd < 0.01, "seed {seed}: {found}, not {expected}");
+        }
+        assert_eq!((&all[1]["initial"], &all[1]["path"]), (&Value::from(true), &Value::from("x")));
+        let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).join("fits/initial");
+        assert!(fric(&folder, &["fit", "f.fric", "-q"]).status.success());
+        let tested = fric(&folder, &["test", "out/f.fric"]);
+        assert!(tested.status.success(), "seed {seed}: {tested:?}");
+    }
 }

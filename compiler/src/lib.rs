@@ -117,13 +117,27 @@ pub fn fit(
     options: &Options,
     warnings: &mut Vec<Diagnostic>,
 ) -> Result<fit::Fit, Vec<Diagnostic>> {
-    let (variant, asks, paths) = fit::read(loaded, sources, name, &options.changes, warnings)?;
-    if let Some(error) = experiment::vary::built_in(&variant, &paths) {
-        return Err(vec![error]);
+    let fit::Read { runs: all, unknowns, name, allowed } =
+        fit::read(loaded, sources, name, &options.changes, warnings)?;
+    let mut parts = Vec::new();
+    for fit::Run { variant, paths, held, asks } in all {
+        if let Some(error) = experiment::vary::built_in(&variant, &paths) {
+            return Err(vec![error]);
+        }
+        let many = |variant: experiment::Variant, mut paths: Vec<String>, pole: Option<&str>| {
+            paths.extend(pole.map(str::to_string));
+            let paths = experiment::start_values::params(&variant.system, &paths);
+            // It reads other quantities than measures and plots.
+            runs(variant, None, &paths, &loaded.files, options.interpret)
+        };
+        let held = held.and_then(|variant| {
+            let held = many(variant, paths.clone(), Some(experiment::held::POLE));
+            let pole = held.param(experiment::held::POLE)?.slot;
+            Some((held, pole))
+        });
+        parts.push(fit::Part { varying: many(variant, paths, None), held, asks });
     }
-    let paths = experiment::start_values::params(&variant.system, &paths);
-    // It reads other quantities than measures and plots.
-    Ok(fit::Fit { varying: runs(variant, None, &paths, &loaded.files, options.interpret), asks })
+    Ok(fit::Fit { parts, unknowns, name, allowed })
 }
 
 /// Compiles an experiment once for runs that differ in any of its parameters, as [`varying`] does for those that are
@@ -720,6 +734,7 @@ fn opened<T>(
         observed: Vec::new(),
         data: Vec::new(),
         frame: None,
+        unknowns: Vec::new(),
     };
     let frontend::flatten::Flattened { mut system, mut diagnostics, .. } =
         frontend::flatten::flatten(loaded, sources, &request);
@@ -820,6 +835,7 @@ fn check_variant(loaded: &Loaded, sources: &dyn Sources, variant: &grammar::ast:
         observed: Vec::new(),
         data: Vec::new(),
         frame: None,
+        unknowns: Vec::new(),
     };
     let frontend::flatten::Flattened { system, mut diagnostics, .. } =
         frontend::flatten::flatten(loaded, sources, &request);
@@ -954,6 +970,7 @@ fn defaulted(
         observed: Vec::new(),
         data: Vec::new(),
         frame: None,
+        unknowns: Vec::new(),
     };
     let frontend::flatten::Flattened { system, mut diagnostics, .. } =
         frontend::flatten::flatten(loaded, sources, &request);

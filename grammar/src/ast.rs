@@ -555,6 +555,8 @@ pub enum Spacing {
 #[allow(missing_docs)]
 pub struct Data {
     pub file: Text,
+    /// Further recordings of a fit, with the same columns.
+    pub more: Vec<Text>,
     /// A column called `_` is skipped.
     pub columns: Vec<Column>,
     pub span: Span,
@@ -646,18 +648,32 @@ pub enum FitStatement {
     /// `vary Fs in 1 N .. 2 N, vs`
     Vary(Vec<Vary>, Span),
     Minimise(Minimise),
+    Case(FitCase),
 }
 
-/// `Fc = 0.8 N in 0.1 N .. 10 N`, `m = 1 kg +- 0.1 kg`
+/// `case slow { run … data … minimise … }`: one of several kinds of experiment with common unknowns.
+#[derive(Clone, PartialEq, Debug)]
+#[allow(missing_docs)]
+pub struct FitCase {
+    pub name: Name,
+    pub body: Vec<FitStatement>,
+    pub span: Span,
+}
+
+/// `Fc = 0.8 N in 0.1 N .. 10 N`, `m = 1 kg +- 0.1 kg`, `initial(z) in -1 um .. 1 um each`
 #[derive(Clone, PartialEq, Debug)]
 #[allow(missing_docs)]
 pub struct Vary {
     pub path: Path,
+    /// The initial value of a state.
+    pub initial: bool,
     /// Where the search starts; with `known`, also the value that is known.
     pub start: Option<Expr>,
     /// The standard deviation with which `start` is known.
     pub known: Option<Expr>,
     pub range: Option<Range>,
+    /// Each recording has a value of its own.
+    pub each: bool,
     pub span: Span,
 }
 

@@ -174,6 +174,7 @@ impl<'s, 't> Layout<'s, 't> {
                 "mode" => Place::Mode,
                 "when" | "go" => Place::Resets,
                 "hardware" => Place::Hardware,
+                "case" if place == Place::Fit => Place::Case,
                 _ => continue,
             };
             self.block(piece, inner, level + 1);
@@ -380,7 +381,7 @@ impl<'s, 't> Layout<'s, 't> {
             let long = self.source.word(line.piece.end - 1) == "(";
             let padded = match start.place {
                 Some(Place::Interface | Place::Model | Place::Device | Place::Every) => declares,
-                Some(Place::Experiment | Place::Fit | Place::Rig) => !equation && !long,
+                Some(Place::Experiment | Place::Fit | Place::Case | Place::Rig) => !equation && !long,
                 Some(Place::Mode | Place::Resets | Place::Hardware) | None => false,
             };
             if padded {

@@ -99,7 +99,7 @@ pub fn parse_statements(file: FileId, text: &str) -> (Vec<ExperimentStatement>, 
     let whole = Piece { start: 0, end: reader.source.marks.len() };
     let found = reader.runs(Place::Experiment, whole).into_iter().filter_map(|statement| match statement {
         FitStatement::Experiment(statement) => Some(statement),
-        FitStatement::Vary(..) | FitStatement::Minimise(..) => None,
+        FitStatement::Vary(..) | FitStatement::Minimise(..) | FitStatement::Case(_) => None,
     });
     let found = found.collect();
     (found, reader.finish())
@@ -454,14 +454,16 @@ impl<'t> Reader<'t> {
             Place::Experiment => {
                 let body = self.runs(place, inside).into_iter().filter_map(|statement| match statement {
                     FitStatement::Experiment(statement) => Some(statement),
-                    FitStatement::Vary(..) | FitStatement::Minimise(..) => None,
+                    FitStatement::Vary(..) | FitStatement::Minimise(..) | FitStatement::Case(_) => None,
                 });
                 Item::Experiment(Experiment { name, body: body.collect(), doc, span })
             }
             Place::Fit => Item::Fit(Fit { name, body: self.runs(place, inside), doc, span }),
             Place::Device => Item::Device(Device { name, body: self.frames(inside), doc, span }),
             Place::Rig => Item::Rig(Rig { name, body: self.rig(inside), doc, span }),
-            Place::Every | Place::Mode | Place::Resets | Place::Hardware => unreachable!("no item"),
+            Place::Every | Place::Mode | Place::Resets | Place::Hardware | Place::Case => {
+                unreachable!("no item")
+            }
         };
         named.then_some(item)
     }
@@ -775,12 +777,21 @@ impl<'t> Reader<'t> {
     fn runs(&mut self, place: Place, block: Piece) -> Vec<FitStatement> {
         let mut body = Vec::new();
         for piece in self.source.statements(place, block) {
-            if place == Place::Experiment && matches!(self.source.word(piece.start), "vary" | "minimise") {
-                let word = self.source.word(piece.start);
+            let word = self.source.word(piece.start);
+            let elsewhere = match place {
+                Place::Experiment => matches!(word, "vary" | "minimise"),
+                Place::Case => matches!(word, "vary" | "case"),
+                _ => false,
+            };
+            if elsewhere {
                 self.report(
                     Diagnostic::error("E0001", format!("`{word}` stands in a `fit`"))
-                        .label(self.source.span(piece.start), "this is an experiment"),
+                        .label(self.source.span(piece.start), format!("this is {}", place.words())),
                 );
+                continue;
+            }
+            if place == Place::Fit && word == "case" && self.source.block(piece).is_some() {
+                body.extend(self.fit_case(piece).map(FitStatement::Case));
                 continue;
             }
             let Some(pair) = self.read(Rule::one_run, piece) else { continue };
@@ -793,6 +804,7 @@ impl<'t> Reader<'t> {
                 Rule::sweep => ExperimentStatement::Sweep(self.sweep(pair)),
                 Rule::data => ExperimentStatement::Data(Data {
                     file: self.string(children.one()),
+                    more: children.all(Rule::string).into_iter().map(|file| self.string(file)).collect(),
                     columns: children.all(Rule::column).into_iter().map(|column| self.column(column)).collect(),
                     span,
                 }),
@@ -828,12 +840,13 @@ impl<'t> Reader<'t> {
                 Rule::vary => {
                     let items = children.all(Rule::vary_item).into_iter().map(|item| {
                         let (span, is_known) = (self.span(&item), says(&item, Rule::margin));
+                        let [initial, each] = [Rule::kw_initial, Rule::kw_each].map(|word| says(&item, word));
                         let mut children = Children::of(item);
                         let path = self.path(children.one());
                         let start = self.maybe_value(&mut children);
                         let known = is_known.then(|| self.value(&mut children));
                         let range = children.maybe(Rule::range).map(|range| self.range(range));
-                        Vary { path, start, known, range, span }
+                        Vary { path, initial, start, known, range, each, span }
                     });
                     let items = items.collect();
                     body.push(FitStatement::Vary(items, span));
@@ -852,6 +865,16 @@ impl<'t> Reader<'t> {
             }));
         }
         body
+    }
+
+    /// A case of a fit.
+    fn fit_case(&mut self, piece: Piece) -> Option<FitCase> {
+        let (open, inside) = self.source.block(piece)?;
+        let head = self.read(Rule::one_run, Piece { start: piece.start, end: open });
+        // Its statements are read even if its head is unreadable, to report the errors in them.
+        let name = head.map(|head| self.name(Children::of(head).one()));
+        let body = self.runs(Place::Case, inside);
+        Some(FitCase { name: name?, body, span: self.source.span_of(piece) })
     }
 
     fn frames(&mut self, block: Piece) -> DeviceBody {

@@ -61,6 +61,7 @@ pub(crate) enum Place {
     Resets,
     Experiment,
     Fit,
+    Case,
     Device,
     Rig,
     Hardware,
@@ -77,6 +78,7 @@ impl Place {
             Place::Resets => "a block of resets",
             Place::Experiment => "an experiment",
             Place::Fit => "a fit",
+            Place::Case => "a `case` of a fit",
             Place::Device => "a device",
             Place::Rig => "a rig",
             Place::Hardware => "a `hardware` block",
@@ -87,9 +89,10 @@ impl Place {
     fn starters(self) -> &'static [&'static str] {
         match self {
             Place::Experiment => &["run", "solver", "sweep", "data", "plot", "tune", "expect", "show", "record"],
-            Place::Fit => {
-                &["run", "solver", "sweep", "data", "plot", "tune", "expect", "show", "record", "vary", "minimise"]
-            }
+            Place::Fit | Place::Case => &[
+                "run", "solver", "sweep", "data", "plot", "tune", "expect", "show", "record", "vary", "minimise",
+                "case",
+            ],
             Place::Device => &["send", "read"],
             Place::Rig => &[
                 "run", "rate", "solver", "bus", "drive", "hardware", "watchdog", "overrun", "predict", "safe", "stop",

@@ -46,11 +46,11 @@ pub const KEYWORDS: [&str; 36] = [
 
 /// Words with a meaning only in experiments, fits, tables, devices and rigs. They are allowed as names, but never a
 /// unit.
-pub const CONTEXT_WORDS: [&str; 44] = [
-    "after", "against", "as", "at", "before", "bus", "by", "byte", "data", "drive", "expect", "for", "from",
-    "hardware", "hold", "limit", "lin", "linear", "log", "message", "minimise", "overrun", "plot", "predict", "rate",
-    "read", "record", "rotary", "run", "safe", "scale", "send", "show", "slew", "smooth", "solver", "step", "stop",
-    "sweep", "title", "tol", "tune", "vary", "watchdog",
+pub const CONTEXT_WORDS: [&str; 46] = [
+    "after", "against", "as", "at", "before", "bus", "by", "byte", "case", "data", "drive", "each", "expect", "for",
+    "from", "hardware", "hold", "limit", "lin", "linear", "log", "message", "minimise", "overrun", "plot", "predict",
+    "rate", "read", "record", "rotary", "run", "safe", "scale", "send", "show", "slew", "smooth", "solver", "step",
+    "stop", "sweep", "title", "tol", "tune", "vary", "watchdog",
 ];
 
 /// Whether `word` is reserved everywhere.

@@ -12,7 +12,7 @@ mod of_laws;
 use super::{End, load, reported, sound, sweep};
 use crate::args;
 use crate::commands::fit::answer::Fitted;
-use crate::commands::fit::search::{Found, Runs, Settings, search};
+use crate::commands::fit::search::{Found, Part, Runs, Settings, search};
 use crate::compile::{self, Asks, Changes, Loaded, Options, Stopwatch};
 use crate::figure::{self, Recorded};
 use crate::plot::{self, Kind, Look};
@@ -25,7 +25,7 @@ use abi::plan::Experiment;
 use grammar::ast::{ExperimentStatement, FitStatement};
 use grammar::diagnostic::Diagnostic;
 use runtime::engine::{self, Continue, Failure};
-use runtime::fit::Trouble;
+use runtime::fit::{Trouble, Way};
 use runtime::package;
 use runtime::run::verdict::Verdict;
 use std::path::{Path, PathBuf};
@@ -44,13 +44,24 @@ pub fn fit(args: &args::Fit, terminal: &mut Terminal) -> End {
             return End::Failed;
         }
     };
-    let data = match args.data.as_deref().map(std::path::absolute).transpose() {
-        Ok(data) => data.map(|path| path.display().to_string()),
+    let data: Result<Vec<PathBuf>, std::io::Error> = args.data.iter().map(std::path::absolute).collect();
+    let data = match data {
+        Ok(data) => data.iter().map(|path| path.display().to_string()).collect::<Vec<String>>(),
         Err(error) => {
             terminal.error(&format!("--data: {error}"));
             return End::Failed;
         }
     };
+    let has_cases = |name: &String| {
+        let fit = compile::find_fit(&loaded, name);
+        fit.is_some_and(|fit| fit.body.iter().any(|statement| matches!(statement, FitStatement::Case(_))))
+    };
+    if let Some(name) = names.iter().find(|name| !data.is_empty() && has_cases(name)) {
+        terminal.error(&format!(
+            "--data: fit `{name}` has cases, each with recordings of its own\n  mend: change the recordings in the text"
+        ));
+        return End::Misused;
+    }
     if sound(&loaded, args.json || args.quiet, terminal, &mut watch).is_err() {
         return End::Failed;
     }
@@ -95,7 +106,7 @@ fn one(args: &args::Fit, loaded: &mut Loaded, name: &str, options: &Options, ter
     if !found.is_empty() && !args.quiet && !args.json {
         reported(loaded, &found, terminal);
     }
-    let method = compiled.varying.experiment.solver.method;
+    let method = compiled.parts[0].varying.experiment.solver.method;
     if let Some(why) = args.stepped.without_effect_and(args.tol, name, method) {
         terminal.error(&why);
         return End::Misused;
@@ -108,12 +119,12 @@ fn one(args: &args::Fit, loaded: &mut Loaded, name: &str, options: &Options, ter
     let found = match search(&runs, Settings::of(args)) {
         Ok(found) => found,
         Err(trouble) => {
-            reported(loaded, &[told(&trouble, &runs.fit.asks)], terminal);
+            reported(loaded, &[told(&trouble, &runs)], terminal);
             return End::Failed;
         }
     };
     let seconds = begin.elapsed().as_secs_f64();
-    let question = Asked { args, file: &args.file, data: options.changes.data.as_deref(), loaded, name, rank: None };
+    let question = Asked { args, file: &args.file, data: &options.changes.data, loaded, name, rank: None };
     conclude(&question, &runs, found, seconds, terminal)
 }
 
@@ -122,8 +133,8 @@ struct Asked<'a> {
     args: &'a args::Fit,
     /// The text with the fit.
     file: &'a Path,
-    /// The recording in place of the text's own.
-    data: Option<&'a str>,
+    /// The recordings in place of the text's own.
+    data: &'a [String],
     loaded: &'a Loaded,
     name: &'a str,
     /// Rank among several laws, and the rms of rows that the law has not seen.
@@ -131,41 +142,49 @@ struct Asked<'a> {
 }
 
 /// Shows the answer of a fit and writes its files.
-fn conclude(question: &Asked, runs: &Runs, (answer, step, note): Found, seconds: f64, terminal: &mut Terminal) -> End {
+fn conclude(question: &Asked, runs: &Runs, (answer, steps, note): Found, seconds: f64, terminal: &mut Terminal) -> End {
     let Asked { args, file, data, loaded, name, rank } = *question;
-    let mut fitted = Fitted::new(name, &runs.fit, answer, step, args.level, seconds);
+    let mut fitted = Fitted::new(name, runs, answer, &steps, args.level, seconds);
     fitted.notes.extend(note);
     fitted.rank = rank;
-    let outcome = match judged(runs, &fitted.answer.values, step) {
-        Ok((outcome, left)) => {
-            fitted.notes.extend(left);
-            outcome
+    let mut outcomes = Vec::new();
+    for ((part, step), items) in runs.parts.iter().zip(&steps).zip(runs.items()) {
+        let values = &fitted.answer.values;
+        let of = if runs.parts.len() > 1 { format!("{}: ", part.asks.label) } else { String::new() };
+        match judged(part, values, *step) {
+            Ok((outcome, left)) => {
+                fitted.notes.extend(left.map(|left| format!("{of}{left}")));
+                outcomes.push(outcome);
+            }
+            Err(failure) => {
+                terminal.error(&format!("{name}: {of}the fitted run stops: {failure}"));
+                return End::Failed;
+            }
         }
-        Err(failure) => {
-            terminal.error(&format!("{name}: the fitted run stops: {failure}"));
-            return End::Failed;
-        }
-    };
-    fitted.verdicts = own(runs, &outcome).to_vec();
-    fitted.measures = runs.measures(&fitted.answer.values, fitted.solver.step);
-    if runs.fit.asks.steady {
-        fitted.unsettled = runs.unsettled(&fitted.answer);
+        let solver = fitted.solver(part, *step);
+        fitted.runs.push(answer::Run {
+            verdicts: own(part, &outcomes[outcomes.len() - 1]).to_vec(),
+            measures: part.measures(values, solver.step),
+            unsettled: if part.asks.steady { part.unsettled(values, &fitted.answer.rms[items]) } else { 0 },
+            solver,
+            step: *step,
+        });
     }
-    let warnings = fitted.warnings(&runs.fit.asks);
+    let warnings = fitted.warnings(runs);
     let statement = compile::find_fit(loaded, name).expect("it has been fitted");
-    let recording = recording(file, statement, data);
+    let recordings: Vec<(PathBuf, String)> =
+        runs.parts.iter().map(|part| recording(file, &part.asks, !data.is_empty())).collect();
     if args.json {
-        terminal.line(&fitted.json(file, &runs.fit.asks, &recording).to_string());
+        terminal.line(&fitted.json(file, runs, &recordings).to_string());
     } else {
         if !args.quiet {
             terminal.line(&terminal.styled(Style::Bold, name));
-            terminal.print(&fitted.words(&runs.fit.asks, terminal));
+            terminal.print(&fitted.words(runs, terminal));
         }
-        let place = text::Place { folder: &args.out, file, data: &recording.0, hash: &recording.1 };
+        let place = text::Place { folder: &args.out, file, recordings: &recordings };
         // A text on the standard input has no place from which another could import it.
-        let text =
-            (!project::is_standard(file)).then(|| text::text(loaded, statement, &fitted, &runs.fit.asks, &place));
-        match written(question, text, runs, &fitted, &outcome, &recording) {
+        let text = (!project::is_standard(file)).then(|| text::text(loaded, statement, &fitted, runs, &place));
+        match written(question, text, runs, &fitted, &outcomes, &recordings) {
             Ok(paths) if !args.quiet => {
                 let paths: Vec<String> = paths.iter().map(|path| path.display().to_string()).collect();
                 terminal.line(&format!("  wrote {}", paths.join(", ")));
@@ -180,38 +199,40 @@ fn conclude(question: &Asked, runs: &Runs, (answer, step, note): Found, seconds:
             reported(loaded, &warnings, terminal);
         }
     }
-    let failed = fitted.verdicts.iter().filter(|verdict| !verdict.passed());
-    if args.quiet {
-        let failed: Vec<_> = failed.clone().cloned().collect();
-        if !failed.is_empty() {
-            terminal.report(&format!("{name}\n{}", results::verdicts(terminal, &failed, None, None, "  ")));
-        }
+    let failed: Vec<Verdict> =
+        fitted.runs.iter().flat_map(|run| &run.verdicts).filter(|verdict| !verdict.passed()).cloned().collect();
+    if args.quiet && !failed.is_empty() {
+        terminal.report(&format!("{name}\n{}", results::verdicts(terminal, &failed, None, None, "  ")));
     }
-    let bad = failed.count() > 0 || !fitted.converged() || args.strict && !warnings.is_empty();
+    let bad = !failed.is_empty() || !fitted.converged() || args.strict && !warnings.is_empty();
     if bad { End::Failed } else { End::Fine }
 }
 
 /// The run with these values, and a range that it left.
-fn judged(runs: &Runs, values: &[f64], step: f64) -> Result<(engine::Outcome, Option<String>), Failure> {
-    let (instance, experiment) = runs.with(values, step).expect("these values have been run");
+fn judged(part: &Part, values: &[f64], step: f64) -> Result<(engine::Outcome, Option<String>), Failure> {
+    let (instance, experiment) = part.with(values, step).expect("these values have been run");
     let description = instance.description().clone();
-    let plots = runs.fit.varying.plots.clone();
+    let plots = part.varying.plots.clone();
     let outcome = engine::run(instance, &Experiment { plots, ..experiment }, &mut |_| Continue::Continue(()))?;
-    let watched = &outcome.verdicts[runs.fit.varying.expects()..];
+    let watched = &outcome.verdicts[part.varying.expects()..];
     let extremes: Vec<(f64, f64)> = watched.iter().map(sweep::extremes).collect();
-    let left = runs.fit.varying.left(&description, &extremes);
+    let left = part.varying.left(&description, &extremes);
     Ok((outcome, left))
 }
 
 /// The verdicts of a fit's own expectations. After them there are the compared measures, and those that watch ranges.
-fn own<'o>(runs: &Runs, outcome: &'o engine::Outcome) -> &'o [Verdict] {
-    &outcome.verdicts[..runs.fit.varying.expects() - runs.slots.len()]
+fn own<'o>(part: &Part, outcome: &'o engine::Outcome) -> &'o [Verdict] {
+    &outcome.verdicts[..part.varying.expects() - part.slots.len()]
 }
 
 /// Whether a fit has expectations.
 pub fn expects(loaded: &Loaded, name: &str) -> bool {
     let is_expect = |statement: &FitStatement| matches!(statement, FitStatement::Experiment(ExperimentStatement::Expect(expect)) if expect.shows.is_none());
-    compile::find_fit(loaded, name).is_some_and(|fit| fit.body.iter().any(is_expect))
+    let has = |statement: &FitStatement| match statement {
+        FitStatement::Case(case) => case.body.iter().any(is_expect),
+        other => is_expect(other),
+    };
+    compile::find_fit(loaded, name).is_some_and(|fit| fit.body.iter().any(has))
 }
 
 /// For `fric test`: fits, and returns the verdicts of its expectations. None if there is no answer, which is reported.
@@ -225,77 +246,77 @@ pub fn verdicts(loaded: &mut Loaded, name: &str, interpret: bool, terminal: &Ter
         }
     };
     let runs = Runs::new(compiled);
-    let settings = Settings { level: args::LEVEL, starts: args::STARTS, seed: 0 };
-    let (answer, step, _) = match search(&runs, settings) {
+    let settings = Settings { level: args::LEVEL, starts: None, seed: 0 };
+    let (answer, steps, _) = match search(&runs, settings) {
         Ok(found) => found,
         Err(trouble) => {
-            reported(loaded, &[told(&trouble, &runs.fit.asks)], terminal);
+            reported(loaded, &[told(&trouble, &runs)], terminal);
             return None;
         }
     };
-    match judged(&runs, &answer.values, step) {
-        Ok((outcome, _)) => Some(own(&runs, &outcome).to_vec()),
-        Err(failure) => {
-            terminal.error(&format!("{name}: the fitted run stops: {failure}"));
-            None
+    let mut all = Vec::new();
+    for (part, step) in runs.parts.iter().zip(&steps) {
+        match judged(part, &answer.values, *step) {
+            Ok((outcome, _)) => all.extend(own(part, &outcome).to_vec()),
+            Err(failure) => {
+                terminal.error(&format!("{name}: the fitted run stops: {failure}"));
+                return None;
+            }
         }
     }
+    Some(all)
 }
 
-/// The recording of a fit and its SHA-256.
-fn recording(file: &Path, fit: &grammar::ast::Fit, other: Option<&str>) -> (PathBuf, String) {
-    let own = fit.body.iter().find_map(|statement| match statement {
-        FitStatement::Experiment(ExperimentStatement::Data(data)) => Some(data.file.text.as_str()),
-        _ => None,
-    });
-    let named = other.or(own).unwrap_or_default();
-    match project::bytes_named(&file.display().to_string(), named) {
+/// The recording of a run and its SHA-256. `given`: it comes from the command line, with an absolute path.
+fn recording(file: &Path, asks: &Asks, given: bool) -> (PathBuf, String) {
+    let from = if given { String::new() } else { file.display().to_string() };
+    match project::bytes_named(&from, &asks.recording) {
         Ok((path, bytes)) => (path, package::hash(&bytes)),
         // It has been read before; now it is gone.
-        Err(_) => (PathBuf::from(named), String::new()),
+        Err(_) => (PathBuf::from(&asks.recording), String::new()),
     }
 }
 
 /// `--check`: the differences with the values as they are written.
 fn check(args: &args::Fit, runs: &Runs, loaded: &Loaded, name: &str, terminal: &mut Terminal) -> End {
-    let asks = &runs.fit.asks;
-    let starts: Vec<f64> = asks.unknowns.iter().map(|unknown| unknown.start).collect();
-    match runs.residuals(&[starts], runs.step()).remove(0) {
+    let starts: Vec<f64> = runs.unknowns.iter().map(|unknown| unknown.start).collect();
+    match runs.residuals(Way::Whole, &[starts], &runs.steps()).remove(0) {
         Ok(residuals) => {
             if !args.quiet {
                 terminal.line(&terminal.styled(Style::Bold, name));
-                terminal.print(&answer::as_written(asks, &residuals));
+                terminal.print(&answer::as_written(runs, &residuals));
             }
             End::Fine
         }
         Err(why) => {
-            reported(loaded, &[told(&Trouble::NoStart(why), asks)], terminal);
+            reported(loaded, &[told(&Trouble::NoStart(why), runs)], terminal);
             End::Failed
         }
     }
 }
 
 /// What went wrong, as a diagnostic.
-fn told(trouble: &Trouble, asks: &Asks) -> Diagnostic {
+fn told(trouble: &Trouble, runs: &Runs) -> Diagnostic {
+    let unknowns = &runs.unknowns;
     match trouble {
         Trouble::NoStart(why) => {
             let starts: Vec<String> =
-                asks.unknowns.iter().map(|one| format!("{} = {}", one.path, show(one.start, &one.unit, 4))).collect();
+                unknowns.iter().map(|one| format!("{} = {}", one.label, show(one.start, &one.unit, 4))).collect();
             Diagnostic::error("E0907", format!("the fit cannot be run from any start: {why}"))
-                .label(asks.name, format!("not with {}", starts.join(", ")))
+                .label(runs.name, format!("not with {}", starts.join(", ")))
                 .help("give a start that can be run, as in `vary Fs = 1.5 N in 1 N .. 2 N`, or a smaller range")
         }
         Trouble::NoInfluence(idle) => {
-            let unknown = &asks.unknowns[idle[0]];
-            let mut error = Diagnostic::error("E0906", format!("`{}` changes nothing that is compared", unknown.path));
+            let unknown = &unknowns[idle[0]];
+            let mut error = Diagnostic::error("E0906", format!("`{}` changes nothing that is compared", unknown.label));
             for k in idle {
-                error = error.label(asks.unknowns[*k].span, "no residual depends on it");
+                error = error.label(unknowns[*k].span, "no residual depends on it");
             }
             error.help("leave it out, compare something that it changes, or record a motion in which it acts")
         }
         Trouble::TooFewRows(rows, unknowns) => {
             let error = Diagnostic::error("E0910", format!("{rows} rows cannot determine {unknowns} unknowns"));
-            error.label(asks.name, "too few rows").help("compare more rows, or vary fewer parameters")
+            error.label(runs.name, "too few rows").help("compare more rows, or vary fewer parameters")
         }
     }
 }
@@ -306,32 +327,35 @@ fn written(
     text: Option<String>,
     runs: &Runs,
     fitted: &Fitted,
-    outcome: &engine::Outcome,
-    recording: &(PathBuf, String),
+    outcomes: &[engine::Outcome],
+    recordings: &[(PathBuf, String)],
 ) -> Result<Vec<PathBuf>, (PathBuf, std::io::Error)> {
-    let asks = &runs.fit.asks;
     let mut files: Vec<(PathBuf, Vec<u8>)> = Vec::new();
     let (args, name) = (question.args, question.name);
-    let at = |ending: &str| args.out.join(format!("{name}.{ending}"));
+    let at = |stem: &str, ending: &str| args.out.join(format!("{stem}.{ending}"));
     if let Some(text) = text {
-        files.push((at("fric"), text.into_bytes()));
+        files.push((at(name, "fric"), text.into_bytes()));
     }
-    files.push((at("json"), format!("{:#}\n", fitted.json(question.file, asks, recording)).into_bytes()));
-    let mut slots = runs.slots.clone();
-    slots.extend(asks.items.iter().flat_map(|item| item.sides.iter().flatten().map(|(_, slot)| *slot)));
-    let point = std::slice::from_ref(&fitted.answer.values);
-    if let Ok(values) = runs.sampled(point, fitted.step, &runs.instants, &slots).remove(0) {
-        files.push((at("csv"), answer::table(asks, &runs.instants, &values).into_bytes()));
-    }
-    let plots = &runs.fit.varying.plots;
-    if !plots.is_empty() {
-        let rms: Vec<String> =
-            asks.items.iter().zip(&fitted.answer.rms).map(|(item, rms)| show(*rms, &item.unit, 3)).collect();
-        let rows = count(asks.rows.len() as u64);
-        let subtitle = format!("{} fitted to {rows} rows, rms {}", asks.model, rms.join(", "));
-        let drawn = Recorded { label: "", plots, recording: &outcome.recording, verdicts: &[] };
-        let drawn = figure::figure(name, &subtitle, 0, &[drawn]);
-        files.push((at("svg"), plot::picture(&drawn, &Look::default(), Kind::Svg)));
+    files.push((at(name, "json"), format!("{:#}\n", fitted.json(question.file, runs, recordings)).into_bytes()));
+    for (((part, run), outcome), items) in runs.parts.iter().zip(&fitted.runs).zip(outcomes).zip(runs.items()) {
+        let asks = &part.asks;
+        let stem = if runs.parts.len() > 1 { format!("{name}_{}", asks.label) } else { name.to_string() };
+        let mut slots = part.slots.clone();
+        slots.extend(asks.items.iter().flat_map(|item| item.sides.iter().flatten().map(|(_, slot)| *slot)));
+        let point = std::slice::from_ref(&fitted.answer.values);
+        if let Ok(values) = part.sampled(point, run.step, &part.instants, &slots).remove(0) {
+            files.push((at(&stem, "csv"), answer::table(asks, &part.instants, &values).into_bytes()));
+        }
+        let plots = &part.varying.plots;
+        if !plots.is_empty() {
+            let rms = asks.items.iter().zip(&fitted.answer.rms[items]);
+            let rms: Vec<String> = rms.map(|(item, rms)| show(*rms, &item.unit, 3)).collect();
+            let rows = count(asks.rows.len() as u64);
+            let subtitle = format!("{} fitted to {rows} rows, rms {}", asks.model, rms.join(", "));
+            let drawn = Recorded { label: "", plots, recording: &outcome.recording, verdicts: &[] };
+            let drawn = figure::figure(&stem, &subtitle, 0, &[drawn]);
+            files.push((at(&stem, "svg"), plot::picture(&drawn, &Look::default(), Kind::Svg)));
+        }
     }
     let mut paths = Vec::new();
     for (path, bytes) in files {

@@ -34,6 +34,7 @@ pub(super) struct CommandLine {
     pub(super) duration: Option<f64>,
     pub(super) vary: Vec<String>,
     pub(super) ports: Option<Ports>,
+    pub(super) held: bool,
 }
 
 /// `PATH = VALUE`
@@ -94,8 +95,8 @@ impl CommandLine {
                 }
             }
         }
-        let Changes { method, step, tol, duration, vary, ports, .. } = changes.clone();
-        CommandLine { set, method, step, tol, duration, vary, ports }
+        let Changes { method, step, tol, duration, vary, ports, held, .. } = changes.clone();
+        CommandLine { set, method, step, tol, duration, vary, ports, held }
     }
 
     pub(super) fn change(set: &Set) -> Change<'_> {

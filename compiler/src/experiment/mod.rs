@@ -5,6 +5,7 @@
 
 mod command_line;
 mod expectations;
+pub mod held;
 pub mod of_fit;
 mod plots;
 mod recording;
@@ -66,8 +67,12 @@ pub struct Changes {
     /// Does not check whether the step is stable, for questions that do not run the experiment, and for a run that is
     /// only compared with it.
     pub any_step: bool,
-    /// A file that replaces the recording of a fit, as an absolute path.
-    pub data: Option<String>,
+    /// Files that replace the recordings of a fit, as absolute paths.
+    pub data: Vec<String>,
+    /// Of a fit: the case and the recording that are run.
+    pub part: of_fit::Part,
+    /// Of a fit: the run is held to its recording, see [`held`].
+    pub held: bool,
     /// Omits the experiment's own expectations. A question at the prompt does not judge the run, and a window of an
     /// expectation may lie beyond the compiled duration.
     pub unjudged: bool,
@@ -120,6 +125,8 @@ pub struct Variant {
     pub begins: f64,
     /// Of a fit: its recording has no times; each row is a steady point.
     pub steady: bool,
+    /// Of a fit: the run is held to its recording.
+    pub held: bool,
     /// Parameters that its panel may turn, in this order; all if there are none.
     pub tuned: Vec<Tuned>,
 }
@@ -161,6 +168,8 @@ struct Statements<'a> {
     stepped: bool,
     /// Names of all lints that it allows.
     allowed: Vec<&'a str>,
+    /// Unknowns of a fit that are no parameters of its instance.
+    unknowns: Vec<&'a ast::Vary>,
 }
 
 /// A change by a sweep or from outside.
@@ -192,8 +201,10 @@ pub fn read(
     let found = file.ast.items().find_map(|item| match item {
         ast::Item::Experiment(experiment) if experiment.name.text == name => Some(Cow::Borrowed(experiment)),
         ast::Item::Fit(one) if one.name.text == name => {
-            fit = Some(one);
-            Some(Cow::Owned(of_fit::experiment_of(one)))
+            let part = of_fit::single(one, &changes.part, &changes.data);
+            let experiment = of_fit::experiment_of(&part);
+            fit = Some(part);
+            Some(Cow::Owned(experiment))
         }
         _ => None,
     });
@@ -208,18 +219,17 @@ pub fn read(
     if !also.is_empty() {
         experiment.to_mut().body.extend(also);
     }
-    if let (Some(file), Some(_)) = (&changes.data, fit) {
-        for statement in &mut experiment.to_mut().body {
-            if let ExperimentStatement::Data(data) = statement {
-                data.file.text.clone_from(file);
-            }
-        }
-    }
+    let fit = fit.as_ref();
     let experiment = &*experiment;
     // The missing `run` may be a misspelt word, which has been reported.
     let Some(mut parts) = parts(experiment, misread || loaded.has_errors(), &mut diagnostics) else {
         return Err(diagnostics);
     };
+    if let (None, Some(more)) = (fit, parts.data.and_then(|data| data.more.first())) {
+        let error = Diagnostic::error("E0301", "an experiment has one recording").label(more.span, "a second one");
+        diagnostics.push(error.help("write an experiment for each; a `fit` takes several"));
+    }
+    parts.unknowns = fit.map_or(Vec::new(), of_fit::own_unknowns);
     // Changes from outside take precedence: a value that is set or varied there is not swept.
     let plain = |text: &str| text.split_whitespace().collect::<String>();
     let path = |path: &ast::Path| plain(loaded.files.slice(path.span));
@@ -406,6 +416,7 @@ fn parts<'a>(
         records,
         stepped,
         allowed,
+        unknowns: Vec::new(),
     })
 }
 
@@ -462,6 +473,7 @@ fn variant<'a>(
     let every: Option<usize> = parts.records.iter().find_map(|record| record.every.as_ref()).map(&mut add);
     on_stage("flatten");
     let mut diagnostics = Vec::new();
+    let mut held = false;
     let (system, types, nodes, ports, cut) = match prepared {
         Some(prepared) => {
             let cut = rig::read(loaded, sources, prepared, overrides, observed, data.to_vec(), &mut diagnostics);
@@ -475,10 +487,16 @@ fn variant<'a>(
         }
         None => {
             let instance = Instance::Written(&parts.run.instance, root);
-            let request = Request { instance, overrides, observed, data: data.to_vec(), frame: None };
+            let unknowns = of_fit::declared(&parts.unknowns, &mut diagnostics);
+            let request = Request { instance, overrides, observed, data: data.to_vec(), frame: None, unknowns };
             let flat = flatten(loaded, sources, &request);
             let mut system = flat.system;
-            diagnostics = flat.diagnostics;
+            diagnostics.extend(flat.diagnostics);
+            if given.held && !flat.observed.is_empty() {
+                let compared = plots.last().map_or(&[][..], |(curves, _)| curves);
+                let compared: Vec<ExprId> = compared.iter().map(|curve| flat.observed[curve.value]).collect();
+                held = held::hold(&mut system, &compared);
+            }
             start_values::open(&mut system, &given.vary);
             let ports = given.ports.as_ref().map(|ports| open(&mut system, ports, &mut diagnostics));
             on_stage("check");
@@ -675,7 +693,22 @@ fn variant<'a>(
     let outputs = ports.outputs.iter().zip(ports_at).map(|((path, _), at)| (path.clone(), slots[at]));
     let ports = (inputs.collect(), outputs.collect());
     let (rows, begins, steady) = (Vec::new(), 0.0, false);
-    Ok(Variant { label, system, types, program, adaptive, experiment, places, ports, rig, rows, begins, steady, tuned })
+    Ok(Variant {
+        label,
+        system,
+        types,
+        program,
+        adaptive,
+        experiment,
+        places,
+        ports,
+        rig,
+        rows,
+        begins,
+        steady,
+        held,
+        tuned,
+    })
 }
 
 /// The rig that an experiment runs, with its descriptions; `None` if it runs a model.

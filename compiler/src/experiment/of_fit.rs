@@ -3,10 +3,13 @@
 //! In: a fit's syntax tree. Out: its statements as an experiment, with a plot of what is compared, the method that suits
 //! its recording, and steady points as a recording over time.
 
+use crate::frontend::flatten::Declared;
+use crate::frontend::literals::quantity;
 use crate::frontend::system::Table;
 use abi::plan::Method;
 use abi::unit::Unit;
 use grammar::ast::{self, BinaryOp, ExperimentStatement, Expr, ExprKind, FitStatement};
+use grammar::diagnostic::Diagnostic;
 
 /// `rms(e)` or `rms(e) / s`: e and s.
 pub fn compared(item: &Expr) -> Option<(&Expr, Option<&Expr>)> {
@@ -30,6 +33,108 @@ fn measure(item: &Expr) -> &Expr {
     }
 }
 
+/// A run of a fit: one of its cases, with one of its recordings.
+#[derive(Clone, Copy, PartialEq, Eq, Default, Debug)]
+pub struct Part {
+    /// Index of the case; 0 of a fit without cases.
+    pub case: usize,
+    /// Index of the recording of the case.
+    pub recording: usize,
+}
+
+/// The cases of a fit.
+pub fn cases(fit: &ast::Fit) -> impl Iterator<Item = &ast::FitCase> {
+    fit.body.iter().filter_map(|statement| match statement {
+        FitStatement::Case(case) => Some(case),
+        FitStatement::Experiment(_) | FitStatement::Vary(..) | FitStatement::Minimise(_) => None,
+    })
+}
+
+/// The statements of one case, together with those that all cases share.
+fn statements(fit: &ast::Fit, case: usize) -> impl Iterator<Item = &FitStatement> {
+    let own = cases(fit).nth(case).map_or(&[][..], |case| &case.body);
+    fit.body.iter().filter(|statement| !matches!(statement, FitStatement::Case(_))).chain(own)
+}
+
+/// The recordings of a case, as written.
+pub fn recordings(fit: &ast::Fit, case: usize) -> Vec<ast::Text> {
+    let data = statements(fit, case).find_map(|statement| match statement {
+        FitStatement::Experiment(ExperimentStatement::Data(data)) => Some(data),
+        _ => None,
+    });
+    data.map_or(Vec::new(), |data| std::iter::once(&data.file).chain(&data.more).cloned().collect())
+}
+
+/// The runs of a fit; at least one for each case. `given`: files that replace its recordings.
+pub fn runs(fit: &ast::Fit, given: &[String]) -> Vec<Part> {
+    let recordings = |case| if given.is_empty() { recordings(fit, case).len() } else { given.len() };
+    let of = |case| (0..recordings(case).max(1)).map(move |recording| Part { case, recording });
+    (0..cases(fit).count().max(1)).flat_map(of).collect()
+}
+
+/// A fit with one run: without cases, and with one recording. It has the name of its case.
+pub fn single(fit: &ast::Fit, part: &Part, given: &[String]) -> ast::Fit {
+    let file = |data: &ast::Data| {
+        let all = std::iter::once(&data.file).chain(&data.more).collect::<Vec<_>>();
+        match given.get(part.recording) {
+            Some(other) => ast::Text { text: other.clone(), ..data.file.clone() },
+            None => (*all.get(part.recording).unwrap_or(&all[0])).clone(),
+        }
+    };
+    let one = |statement: &FitStatement| match statement {
+        FitStatement::Experiment(ExperimentStatement::Data(data)) => {
+            let data = ast::Data { file: file(data), more: Vec::new(), ..data.clone() };
+            FitStatement::Experiment(ExperimentStatement::Data(data))
+        }
+        other => other.clone(),
+    };
+    let name = cases(fit).nth(part.case).map_or(&fit.name, |case| &case.name).clone();
+    ast::Fit { name, body: statements(fit, part.case).map(one).collect(), ..fit.clone() }
+}
+
+/// Unknowns that the arguments of `run` name: they are no parameters of the instance, but of the fit.
+pub fn own_unknowns(fit: &ast::Fit) -> Vec<&ast::Vary> {
+    let run = fit.body.iter().find_map(|statement| match statement {
+        FitStatement::Experiment(ExperimentStatement::Run(run)) => Some(&run.instance),
+        _ => None,
+    });
+    let Some(run) = run else { return Vec::new() };
+    let all = fit.body.iter().flat_map(|statement| match statement {
+        FitStatement::Vary(all, _) => &all[..],
+        FitStatement::Experiment(_) | FitStatement::Minimise(_) | FitStatement::Case(_) => &[],
+    });
+    let is_own = |vary: &&ast::Vary| {
+        let name = vary.path.single().filter(|_| !vary.initial);
+        name.is_some_and(|name| mentions(run, &|path| path.single().is_some_and(|other| other.text == name.text)))
+    };
+    all.filter(is_own).collect()
+}
+
+/// The path of an unknown of the fit itself. No declared parameter can have such a name.
+pub fn own_path(name: &str) -> String {
+    format!("{name}(fit)")
+}
+
+/// Unknowns of the fit itself as flattening declares them: name, path, unit and value in SI.
+pub fn declared(unknowns: &[&ast::Vary], diagnostics: &mut Vec<Diagnostic>) -> Vec<Declared> {
+    let one = |vary: &&ast::Vary| {
+        let low = match &vary.range {
+            Some(ast::Range::Between(low, _)) => Some(low),
+            Some(ast::Range::Bound(..)) | None => None,
+        };
+        let unit = low.into_iter().chain(&vary.start).find_map(quantity).map(|(_, unit, _)| unit);
+        let value = vary.start.iter().chain(low).find_map(quantity).map(|(value, _, _)| value);
+        if unit.is_none() {
+            let error = Diagnostic::error("E0904", format!("`{}` has no range", vary.path.segments[0].name.text));
+            let error = error.label(vary.path.span, "from where to where?");
+            diagnostics.push(error.help("an unknown of the fit itself needs its own: `vary F0 in -1 N .. 1 N`"));
+        }
+        let name = vary.path.segments[0].name.clone();
+        Some(Declared { path: own_path(&name.text), name, unit: unit?, value: value? })
+    };
+    unknowns.iter().filter_map(one).collect()
+}
+
 /// The experiment that a fit runs. Its last plot holds the compared differences, each followed by its two sides; its
 /// last expectations show the compared measures, without their window.
 pub fn experiment_of(fit: &ast::Fit) -> ast::Experiment {
@@ -42,7 +147,7 @@ pub fn experiment_of(fit: &ast::Fit) -> ast::Experiment {
     for statement in &fit.body {
         match statement {
             FitStatement::Experiment(one) => body.push(one.clone()),
-            FitStatement::Vary(..) => {}
+            FitStatement::Vary(..) | FitStatement::Case(_) => {}
             FitStatement::Minimise(minimise) => {
                 for item in &minimise.items {
                     let Some((of, _)) = compared(item) else { continue };
@@ -83,19 +188,24 @@ pub fn sides(of: &Expr) -> Option<[&Expr; 2]> {
 
 /// Whether an argument of an instance, or of an instance in it, reads the recording.
 pub fn reads_recording(instance: &ast::Instance) -> bool {
+    mentions(instance, &|path| path.segments.len() > 1 && path.segments[0].name.text == "data")
+}
+
+/// Whether an argument of an instance, or of an instance in it, contains such a path.
+fn mentions(instance: &ast::Instance, is: &dyn Fn(&ast::Path) -> bool) -> bool {
     instance.args.iter().any(|bind| match &bind.value {
-        ast::BindValue::Expr(expr) => reads(expr),
-        ast::BindValue::Instance(instance) => reads_recording(instance),
+        ast::BindValue::Expr(expr) => contains(expr, is),
+        ast::BindValue::Instance(instance) => mentions(instance, is),
     })
 }
 
-fn reads(expr: &Expr) -> bool {
+fn contains(expr: &Expr, is: &dyn Fn(&ast::Path) -> bool) -> bool {
     match &expr.kind {
-        ExprKind::Path(path) => path.segments.len() > 1 && path.segments[0].name.text == "data",
-        ExprKind::Call { args, .. } => args.iter().any(reads),
-        ExprKind::Unary(_, a) => reads(a),
-        ExprKind::Binary(_, _, a, b) => reads(a) || reads(b),
-        ExprKind::If(a, b, c) => reads(a) || reads(b) || reads(c),
+        ExprKind::Path(path) => is(path),
+        ExprKind::Call { args, .. } => args.iter().any(|a| contains(a, is)),
+        ExprKind::Unary(_, a) => contains(a, is),
+        ExprKind::Binary(_, _, a, b) => contains(a, is) || contains(b, is),
+        ExprKind::If(a, b, c) => contains(a, is) || contains(b, is) || contains(c, is),
         ExprKind::Number { .. } | ExprKind::Derivative { .. } | ExprKind::Hole | ExprKind::Error => false,
     }
 }

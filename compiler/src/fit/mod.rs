@@ -1,7 +1,7 @@
-//! Reads fits: which parameters are unknown, in which ranges, and which quantities are compared with a recording.
+//! Reads fits: which parameters are unknown, in which ranges, and which quantities are compared with recordings.
 //!
-//! In: a fit's syntax tree. Out: the experiment that it runs, lowered, and a [`Fit`] of slots and numbers. Knows nothing
-//! of the search.
+//! In: a fit's syntax tree. Out: the experiments that it runs, one for each recording of each case, lowered, and their
+//! unknowns as slots and numbers. Knows nothing of the search.
 
 mod unknown;
 
@@ -9,7 +9,7 @@ pub use unknown::Unknown;
 
 use crate::experiment::of_fit::{self, compared, reads_recording, sides};
 use crate::experiment::vary::{Varying, param_of};
-use crate::experiment::{self, Changes, Variant};
+use crate::experiment::{self, Changes, Variant, held};
 use crate::fit::unknown::{typical, unknown};
 use crate::frontend::literals::number;
 use crate::frontend::resolve::Loaded;
@@ -24,17 +24,37 @@ use grammar::span::Span;
 
 /// A fit, compiled.
 pub struct Fit {
+    /// Its runs: each recording of each case.
+    pub parts: Vec<Part>,
+    /// The unknown parameters, of all runs together.
+    pub unknowns: Vec<Unknown>,
+    /// The name of the fit.
+    pub name: Span,
+    /// Lints that the fit allows.
+    pub allowed: Vec<String>,
+}
+
+/// A run of a fit, compiled.
+pub struct Part {
     /// Runs of its experiment under other values.
     pub varying: Varying,
+    /// The same runs, held to the recording by an observer whose pole is in this slot; none if no state is compared.
+    pub held: Option<(Varying, Slot)>,
     /// What it asks.
     pub asks: Asks,
 }
 
-/// What a fit asks, in slots and numbers.
+/// What a run of a fit asks, in slots and numbers.
 #[derive(Clone, Debug)]
 pub struct Asks {
-    /// The unknown parameters.
-    pub unknowns: Vec<Unknown>,
+    /// What it is called beside other runs: the case, the recording, or both.
+    pub label: String,
+    /// The recording, as written.
+    pub recording: String,
+    /// Which case and which recording it is.
+    pub place: of_fit::Part,
+    /// The slot of each unknown of the fit; none if this run does not depend on it.
+    pub slots: Vec<Option<Slot>>,
     /// The compared quantities.
     pub items: Vec<Item>,
     /// Times of the rows of the recording in s, from 0.
@@ -49,14 +69,14 @@ pub struct Asks {
     pub window: (f64, f64),
     /// Whether the recording drives the run.
     pub driven: bool,
+    /// Whether the model has regimes.
+    pub regimes: bool,
     /// The solver is written in the text or given from outside.
     pub solver_given: bool,
     /// The model that the fit runs, as written.
     pub model: String,
-    /// The name of the fit.
-    pub name: Span,
-    /// Lints that the fit allows.
-    pub allowed: Vec<String>,
+    /// The rows that are compared.
+    compared: usize,
 }
 
 /// A compared quantity.
@@ -74,14 +94,37 @@ pub struct Item {
     pub sides: Option<[(String, Slot); 2]>,
 }
 
-/// The statements of a fit that are no experiment's.
+/// The statements of a run of a fit that are no experiment's.
 struct Parts<'a> {
-    fit: &'a ast::Fit,
     run: &'a ast::Run,
     vary: Vec<&'a ast::Vary>,
     minimise: &'a ast::Minimise,
     /// The compared expressions and their standard deviations.
     items: Vec<(&'a Expr, Option<&'a Expr>)>,
+}
+
+/// A run of a fit, lowered.
+pub struct Run {
+    /// Its experiment.
+    pub variant: Variant,
+    /// The paths that vary.
+    pub paths: Vec<String>,
+    /// The same, held to its recording.
+    pub held: Option<Variant>,
+    /// What it asks.
+    pub asks: Asks,
+}
+
+/// A fit, lowered.
+pub struct Read {
+    /// Its runs.
+    pub runs: Vec<Run>,
+    /// The unknown parameters.
+    pub unknowns: Vec<Unknown>,
+    /// Its name.
+    pub name: Span,
+    /// Lints that it allows.
+    pub allowed: Vec<String>,
 }
 
 /// The fit of this name in the root file.
@@ -92,7 +135,12 @@ pub fn find<'a>(loaded: &'a Loaded, name: &str) -> Option<&'a ast::Fit> {
     })
 }
 
-/// Reads a fit: the experiment that it runs with its unknowns variable, and what it asks.
+/// The statements of a run of a fit: of one case, with one recording. Others than those of experiments are as written.
+pub fn single(fit: &ast::Fit, part: of_fit::Part) -> ast::Fit {
+    of_fit::single(fit, &part, &[])
+}
+
+/// Reads a fit: the experiments that it runs with its unknowns variable, and what it asks.
 ///
 /// # Errors All errors of the fit and of the models it runs.
 pub fn read(
@@ -101,15 +149,192 @@ pub fn read(
     name: &str,
     changes: &Changes,
     warnings: &mut Vec<Diagnostic>,
-) -> Result<(Variant, Asks, Vec<String>), Vec<Diagnostic>> {
+) -> Result<Read, Vec<Diagnostic>> {
     let Some(fit) = find(loaded, name).cloned() else {
         let error = Diagnostic::error("E0201", format!("there is no fit `{name}`"));
         return Err(vec![error.label(Span::new(loaded.root(), 0, 0), "in this file")]);
     };
-    let parts = parts(&fit)?;
-    let paths: Vec<String> = parts.vary.iter().map(|vary| plain(loaded, vary.path.span)).collect();
+    let places = of_fit::runs(&fit, &changes.data);
+    let labels = labels(&fit, &places, &changes.data);
+    let mut diagnostics = Vec::new();
+    let mut found: Vec<(Run, ast::Fit)> = Vec::new();
+    for (place, (label, recording)) in places.iter().zip(labels) {
+        let single = of_fit::single(&fit, place, &changes.data);
+        let changes = Changes { part: *place, ..changes.clone() };
+        let kind = if of_fit::cases(&fit).next().is_some() { "case" } else { "fit" };
+        match run(loaded, sources, (name, kind), &changes, &single, warnings) {
+            Ok(mut run) => {
+                (run.asks.label, run.asks.recording, run.asks.place) = (label, recording, *place);
+                found.push((run, single));
+            }
+            // The same text gives the same errors for each recording.
+            Err(errors) => {
+                diagnostics.extend(errors.into_iter().filter(|one| !diagnostics.contains(one)).collect::<Vec<_>>())
+            }
+        }
+    }
+    if !diagnostics.is_empty() {
+        return Err(diagnostics);
+    }
+    let vary: Vec<&ast::Vary> = fit.body.iter().flat_map(varied).collect();
+    let unknowns = unknowns(loaded, &vary, &mut found, &mut diagnostics);
+    let counts: Vec<(usize, usize)> = (0..found.len())
+        .map(|k| {
+            let asks = &found[k].0.asks;
+            let own = unknowns.iter().filter(|unknown| unknown.of == Some(k)).count();
+            (asks.compared * asks.items.len(), own)
+        })
+        .collect();
+    let minimise = found[0].1.body.iter().find_map(|statement| match statement {
+        FitStatement::Minimise(minimise) => Some(minimise.span),
+        FitStatement::Experiment(_) | FitStatement::Vary(..) | FitStatement::Case(_) => None,
+    });
+    let rows: usize = counts.iter().map(|(rows, _)| rows).sum();
+    let place = minimise.unwrap_or(fit.name.span);
+    let few = counts.iter().copied().find(|(rows, own)| rows <= own && *own > 0);
+    let few = few.or((rows <= unknowns.len()).then_some((rows, unknowns.len())));
+    if let Some((rows, unknowns)) = few.filter(|_| diagnostics.is_empty()) {
+        let [rows, unknowns] = [(rows, "row"), (unknowns, "unknown")].map(counted);
+        let message = format!("{rows} cannot determine {unknowns}");
+        let error = Diagnostic::error("E0910", message).label(place, "compared here");
+        diagnostics.push(error.help("compare more rows, or vary fewer parameters"));
+    }
+    if !diagnostics.is_empty() {
+        return Err(diagnostics);
+    }
+    let allowed = fit.body.iter().filter_map(|statement| match statement {
+        FitStatement::Experiment(ExperimentStatement::Allow(allow)) => Some(allow.lint.text.clone()),
+        _ => None,
+    });
+    let allowed = allowed.collect();
+    Ok(Read { runs: found.into_iter().map(|(run, _)| run).collect(), unknowns, name: fit.name.span, allowed })
+}
+
+/// What each run is called, and its recording as written. Names that occur twice are numbered.
+fn labels(fit: &ast::Fit, places: &[of_fit::Part], given: &[String]) -> Vec<(String, String)> {
+    let case = |place: &of_fit::Part| of_fit::cases(fit).nth(place.case).map(|case| case.name.text.clone());
+    let recording = |place: &of_fit::Part| match given.get(place.recording) {
+        Some(file) => file.clone(),
+        None => {
+            of_fit::recordings(fit, place.case).get(place.recording).map_or(String::new(), |file| file.text.clone())
+        }
+    };
+    let stem = |file: &str| {
+        let name = file.rsplit(['/', '\\']).next().unwrap_or(file);
+        name.rsplit_once('.').map_or(name, |(stem, _)| stem).to_string()
+    };
+    let mut out: Vec<(String, String)> = Vec::new();
+    for place in places {
+        let recording = recording(place);
+        let of_case = places.iter().filter(|other| other.case == place.case).count();
+        let label = match case(place) {
+            Some(case) if of_case == 1 => case,
+            Some(case) => format!("{case}_{}", stem(&recording)),
+            None => stem(&recording),
+        };
+        let twins =
+            out.iter().filter(|(other, _)| other.rsplit_once('~').map_or(&other[..], |(name, _)| name) == label);
+        let label = match twins.count() {
+            0 => label,
+            n => format!("{label}~{}", n + 1),
+        };
+        out.push((label, recording));
+    }
+    out.into_iter().map(|(label, recording)| (label.replace('~', "_"), recording)).collect()
+}
+
+fn varied(statement: &FitStatement) -> &[ast::Vary] {
+    match statement {
+        FitStatement::Vary(all, _) => all,
+        FitStatement::Experiment(_) | FitStatement::Minimise(_) | FitStatement::Case(_) => &[],
+    }
+}
+
+/// The unknowns of all runs; enters their slots into the runs.
+fn unknowns(
+    loaded: &Loaded,
+    vary: &[&ast::Vary],
+    runs: &mut [(Run, ast::Fit)],
+    diagnostics: &mut Vec<Diagnostic>,
+) -> Vec<Unknown> {
+    let mut all: Vec<Unknown> = Vec::new();
+    for one in vary {
+        let path = plain(loaded, one.path.span);
+        let systems: Vec<String> = runs.iter().map(|(_, single)| system_path(one, &path, single)).collect();
+        let has = |k: usize| unknown::exists(&runs[k].0.variant.program.description, one, &systems[k]);
+        let mut with: Vec<usize> = (0..runs.len()).filter(|k| has(*k)).collect();
+        if with.is_empty() {
+            // The first run says what is wrong.
+            with.push(0);
+        }
+        let groups: Vec<Vec<usize>> = if one.each { with.into_iter().map(|k| vec![k]).collect() } else { vec![with] };
+        for group in groups {
+            let (run, _) = &runs[group[0]];
+            let Some(mut read) = unknown(&run.variant, one, (&path, &systems[group[0]]), diagnostics) else { break };
+            if one.each {
+                read.of = Some(group[0]);
+                if runs.len() > 1 {
+                    read.label = format!("{} of {}", read.label, run.asks.label);
+                }
+            }
+            let at = all.len();
+            for (k, (run, _)) in runs.iter_mut().enumerate() {
+                let slot =
+                    group.contains(&k).then(|| param_of(&run.variant.program.description, &systems[k])).flatten();
+                run.asks.slots.resize(at, None);
+                run.asks.slots.push(slot.map(|param| param.slot));
+            }
+            all.push(read);
+        }
+    }
+    for (run, _) in runs.iter() {
+        order(run, &mut all);
+    }
+    all
+}
+
+/// Enters which unknowns must not lie below which others, as the ranges and `require` conditions of a run say.
+fn order(run: &Run, unknowns: &mut [Unknown]) {
+    let Run { variant, asks, .. } = run;
+    let at = |slot: Slot| asks.slots.iter().position(|other| *other == Some(slot));
+    for (upper, lower) in unknown::orders(variant) {
+        let (Some(upper), Some(lower)) = (at(upper), at(lower)) else { continue };
+        let shared = unknowns[lower].of.is_none() || unknowns[lower].of == unknowns[upper].of;
+        let room = unknowns[upper].range.1 - unknowns[lower].range.0;
+        let least = 1e-2 * (unknowns[lower].range.1 - unknowns[lower].range.0);
+        let mut below = Some(lower);
+        while below.is_some_and(|k| k != upper) {
+            below = below.and_then(|k| unknowns[k].above);
+        }
+        if unknowns[upper].above.is_none() && below.is_none() && shared && room > least {
+            unknowns[upper].above = Some(lower);
+        }
+    }
+}
+
+/// The path of an unknown in the system of a run.
+fn system_path(vary: &ast::Vary, path: &str, single: &ast::Fit) -> String {
+    match of_fit::own_unknowns(single).iter().any(|own| own.span == vary.span) {
+        true => of_fit::own_path(path),
+        false => path.to_string(),
+    }
+}
+
+/// Reads one run of a fit: the experiment with its unknowns variable, and what it asks. `kind`: what its statements
+/// stand in.
+fn run(
+    loaded: &mut Loaded,
+    sources: &dyn Sources,
+    (name, kind): (&str, &str),
+    changes: &Changes,
+    fit: &ast::Fit,
+    warnings: &mut Vec<Diagnostic>,
+) -> Result<Run, Vec<Diagnostic>> {
+    let parts = parts(fit, kind)?;
+    let paths: Vec<String> =
+        parts.vary.iter().map(|vary| system_path(vary, &plain(loaded, vary.path.span), fit)).collect();
     let mut changes = Changes { vary: paths.clone(), ..changes.clone() };
-    let solver_given = changes.method.is_some() || changes.step.is_some() || has_solver(&fit);
+    let solver_given = changes.method.is_some() || changes.step.is_some() || has_solver(fit);
     let mut first_warnings = Vec::new();
     let first = experiment::read(loaded, sources, name, &changes, &mut first_warnings, &mut |_| ());
     // A parameter that is computed from others, or has no value, is assigned one, as in a sweep.
@@ -124,8 +349,11 @@ pub fn read(
         }
         Err(_) => (0..paths.len()).collect(),
     };
-    let set: Vec<String> =
-        missing.iter().filter_map(|k| Some(format!("{}={}", paths[*k], typical(parts.vary[*k])?))).collect();
+    let set: Vec<String> = missing
+        .iter()
+        .filter(|k| !parts.vary[**k].initial && !paths[**k].ends_with(')'))
+        .filter_map(|k| Some(format!("{}={}", paths[*k], typical(parts.vary[*k])?)))
+        .collect();
     let variants = match first {
         Ok(variants) if set.is_empty() => {
             warnings.append(&mut first_warnings);
@@ -142,18 +370,29 @@ pub fn read(
     };
     let mut variant = variants.into_iter().next().expect("there is one combination");
     let mut diagnostics = Vec::new();
-    let asks = asks(loaded, &parts, &variant, &paths, solver_given, &mut diagnostics);
-    match asks.filter(|_| diagnostics.is_empty()) {
-        Some(asks) => {
-            let plan = &mut variant.experiment;
-            let shown = plan.expects.len() - asks.items.len();
-            for measure in &mut plan.expects[shown..] {
-                (measure.after, measure.before) = (asks.window.0, asks.window.1.min(plan.duration));
-            }
-            Ok((variant, asks, paths))
+    let asks = asks(loaded, &parts, &variant, solver_given, &mut diagnostics);
+    let Some(asks) = asks.filter(|_| diagnostics.is_empty()) else { return Err(diagnostics) };
+    let window = |plan: &mut abi::plan::Experiment| {
+        let shown = plan.expects.len() - asks.items.len();
+        for measure in &mut plan.expects[shown..] {
+            (measure.after, measure.before) = (asks.window.0, asks.window.1.min(plan.duration));
         }
-        None => Err(diagnostics),
-    }
+    };
+    window(&mut variant.experiment);
+    let held = match asks.regimes || asks.steady {
+        true => None,
+        false => {
+            let vary = paths.iter().cloned().chain([held::POLE.to_string()]).collect();
+            let changes = Changes { held: true, vary, any_step: true, ..changes };
+            let read = experiment::read(loaded, sources, name, &changes, &mut Vec::new(), &mut |_| ());
+            let held = read.ok().and_then(|variants| variants.into_iter().next()).filter(|held| held.held);
+            held.map(|mut held| {
+                window(&mut held.experiment);
+                held
+            })
+        }
+    };
+    Ok(Run { variant, paths, held, asks })
 }
 
 fn has_solver(fit: &ast::Fit) -> bool {
@@ -166,13 +405,14 @@ fn plain(loaded: &Loaded, span: Span) -> String {
 }
 
 /// The statements of a fit, by kind.
-fn parts(fit: &ast::Fit) -> Result<Parts<'_>, Vec<Diagnostic>> {
+fn parts<'a>(fit: &'a ast::Fit, kind: &str) -> Result<Parts<'a>, Vec<Diagnostic>> {
     let mut diagnostics = Vec::new();
     let (mut runs, mut data, mut minimise, mut vary) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
     for statement in &fit.body {
         match statement {
             FitStatement::Vary(all, _) => vary.extend(all),
             FitStatement::Minimise(one) => minimise.push(one),
+            FitStatement::Case(_) => {}
             FitStatement::Experiment(ExperimentStatement::Run(one)) => runs.push(one),
             FitStatement::Experiment(ExperimentStatement::Data(one)) => data.push(one.span),
             FitStatement::Experiment(ExperimentStatement::Sweep(one)) => {
@@ -196,7 +436,7 @@ fn parts(fit: &ast::Fit) -> Result<Parts<'_>, Vec<Diagnostic>> {
     }
     let mut lacks = |what: &str, is_there: bool, help: &str| {
         if !is_there {
-            let error = Diagnostic::error("E0902", format!("fit `{}` has no `{what}`", fit.name.text));
+            let error = Diagnostic::error("E0902", format!("{kind} `{}` has no `{what}`", fit.name.text));
             diagnostics.push(error.label(fit.name.span, format!("there is no `{what}` in it")).help(help));
         }
     };
@@ -205,13 +445,15 @@ fn parts(fit: &ast::Fit) -> Result<Parts<'_>, Vec<Diagnostic>> {
     lacks("vary", !vary.is_empty(), "add what is unknown: `vary Fc in 0.1 N .. 10 N`");
     lacks("minimise", !minimise.is_empty(), "add what is compared: `minimise rms(F - data.F)`");
     if let [first, again, ..] = &minimise[..] {
-        let error = Diagnostic::error("E0301", "a fit has one `minimise`")
+        let error = Diagnostic::error("E0301", format!("a {kind} has one `minimise`"))
             .label(again.span, "again here")
             .label(first.span, "first here");
         diagnostics.push(error.help("list what is compared: `minimise rms(F - data.F), rms(x - data.x)`"));
     }
-    let name_of =
-        |vary: &ast::Vary| vary.path.segments.iter().map(|one| (one.name.text.clone(), one.index)).collect::<Vec<_>>();
+    let name_of = |vary: &ast::Vary| {
+        let path = vary.path.segments.iter().map(|one| (one.name.text.clone(), one.index)).collect::<Vec<_>>();
+        (vary.initial, path)
+    };
     for (k, one) in vary.iter().enumerate() {
         if let Some(first) = vary[..k].iter().find(|other| name_of(other) == name_of(one)) {
             let error = Diagnostic::error("E0301", "this parameter is varied twice")
@@ -239,7 +481,7 @@ fn parts(fit: &ast::Fit) -> Result<Parts<'_>, Vec<Diagnostic>> {
         }
     }
     match (diagnostics.is_empty(), runs.first(), minimise.first()) {
-        (true, Some(run), Some(minimise)) => Ok(Parts { fit, run, vary, minimise, items }),
+        (true, Some(run), Some(minimise)) => Ok(Parts { run, vary, minimise, items }),
         _ => Err(diagnostics),
     }
 }
@@ -248,18 +490,10 @@ fn asks(
     loaded: &Loaded,
     parts: &Parts,
     variant: &Variant,
-    paths: &[String],
     solver_given: bool,
     diagnostics: &mut Vec<Diagnostic>,
 ) -> Option<Asks> {
-    let description = &variant.program.description;
     let plots = &variant.experiment.plots;
-    let unknowns: Vec<Unknown> = parts
-        .vary
-        .iter()
-        .zip(paths)
-        .filter_map(|(vary, path)| unknown(variant, description, vary, path, diagnostics))
-        .collect();
     let items = items(loaded, parts, plots.last()?, diagnostics);
     let second = Dimension::of([0, 0, 1, 0, 0]);
     let mut time = |edge: Option<&Expr>, open: f64| edge.map_or(Some(open), |edge| number(edge, second, diagnostics));
@@ -277,20 +511,12 @@ fn asks(
         let error = Diagnostic::error("E0902", "no row of the recording is compared")
             .label(parts.minimise.span, format!("the recording goes from 0 s to {end} s"));
         diagnostics.push(error.help("write a window that holds rows; time begins at the first row"));
-    } else if compared * parts.items.len() <= parts.vary.len() {
-        let [rows, unknowns] = [(compared, "row"), (parts.vary.len(), "unknown")].map(counted);
-        let message = format!("{rows} cannot determine {unknowns}");
-        let error = Diagnostic::error("E0910", message).label(parts.minimise.span, "compared here");
-        diagnostics.push(error.help("compare more rows, or vary fewer parameters"));
     }
-    let allowed = parts.fit.body.iter().filter_map(|statement| match statement {
-        FitStatement::Experiment(ExperimentStatement::Allow(allow)) => Some(allow.lint.text.clone()),
-        _ => None,
-    });
     Some(Asks {
-        name: parts.fit.name.span,
-        allowed: allowed.collect(),
-        unknowns,
+        label: String::new(),
+        recording: String::new(),
+        place: of_fit::Part::default(),
+        slots: Vec::new(),
         items,
         corners: of_fit::corners(&rows, variant.steady),
         rows,
@@ -299,7 +525,9 @@ fn asks(
         window: (after, before),
         driven: reads_recording(&parts.run.instance),
         solver_given,
+        regimes: !variant.system.automata.is_empty(),
         model: parts.run.instance.model.text.clone(),
+        compared,
     })
 }
 

@@ -219,6 +219,7 @@ pub fn read<'a>(
         overrides,
         observed,
         data,
+        unknowns: Vec::new(),
         frame: Some(Frame {
             model: &prepared.model,
             file,

@@ -12,6 +12,6 @@ pub mod noise;
 pub mod estimate;
 pub mod ranking;
 
-pub use estimate::{Answer, Item, Question, Trouble, fit};
+pub use estimate::{Answer, Item, Minima, Question, Trouble, Way, fit};
 pub use trust_region::Ended;
 pub use unknowns::{Elementary, Unknown};

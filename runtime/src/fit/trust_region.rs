@@ -9,6 +9,10 @@
 
 use crate::fit::least_squares::{Singular, Triangle, singular};
 
+/// A search ends if so many trials gain less than this part together.
+const VAIN: u32 = 25;
+const VAIN_GAIN: f64 = 1e-6;
+
 /// What is minimised.
 pub trait Objective {
     /// Half the sum of squares at these coordinates; none if the model cannot be run there.
@@ -67,6 +71,7 @@ pub fn minimise(start: &[f64], low: &[f64], high: &[f64], objective: &mut dyn Ob
     let Some(mut triangle) = objective.linearise(&x) else { return end(x, cost, None, Ended::NoStart, trials) };
     let mut inverse_scale = lengths(&triangle, None);
     let (mut radius, mut alpha) = (f64::NAN, 0.0);
+    let mut before_these = cost;
     loop {
         let g = triangle.gradient();
         let scale: Vec<f64> = inverse_scale.iter().map(|length| 1.0 / length).collect();
@@ -123,6 +128,15 @@ pub fn minimise(start: &[f64], low: &[f64], high: &[f64], objective: &mut dyn Ob
                 radius *= 2.0;
             }
             let small_gain = gain < limits.tolerance * cost && ratio > 0.25;
+            // Where the objective is rough, or a valley is flat, many trials gain next to nothing together.
+            if trials.is_multiple_of(VAIN) {
+                let is_vain = before_these - cost.min(found) < limits.tolerance.max(VAIN_GAIN) * cost;
+                before_these = cost.min(found);
+                if is_vain {
+                    let (x, cost) = if gain > 0.0 { (tried, found) } else { (x, cost) };
+                    return end(x, cost, Some(triangle), Ended::Small, trials);
+                }
+            }
             let small_step = norm(&step) < limits.tolerance * (limits.tolerance + norm(&x));
             if small_gain || small_step {
                 let (x, cost) = if gain > 0.0 { (tried, found) } else { (x, cost) };

@@ -1,6 +1,7 @@
 //! The answer of a fit in words, as JSON and as a table.
 
-use crate::compile::{Asks, Fit, FitItem, FitUnknown, HELD};
+use super::search::{Part, Runs};
+use crate::compile::{Asks, FitItem, FitUnknown, HELD};
 use crate::quantity::{count, duration, show, significant};
 use crate::results::{self, number};
 use crate::terminal::Terminal;
@@ -26,62 +27,91 @@ pub struct Fitted {
     name: String,
     /// What was found.
     pub answer: Answer,
-    /// Step of the runs in s.
-    pub step: f64,
-    /// The solver of the text to go on with: with a quarter of the step, so that its numerical error is small against
-    /// its noise, unless the step is given.
-    pub solver: Solver,
-    /// The model with the values found, to paste.
-    pub instance: String,
+    /// Its runs, in the order of the recordings.
+    pub runs: Vec<Run>,
+    /// Each model with the values found, to paste.
+    pub instances: Vec<String>,
     /// The values found, each as `--set` takes it.
     pub set: Vec<String>,
     /// Probability of the intervals.
     pub level: f64,
     /// Time of the search in s.
     seconds: f64,
-    /// Of steady points: at how many the model does not settle.
-    pub unsettled: usize,
-    /// The compared measures of a run by that solver, in SI.
-    pub measures: Vec<f64>,
-    /// What the fitted run is expected to fulfil.
-    pub verdicts: Vec<Verdict>,
     /// Rank among several laws, and the rms of rows that the law has not seen, in SI.
     pub rank: Option<(usize, f64)>,
     /// Notes for the user.
     pub notes: Vec<String>,
 }
 
+/// A run against one recording, with the values found.
+pub struct Run {
+    /// Step of the search in s.
+    pub step: f64,
+    /// The solver of the text to go on with: with a quarter of the step, so that its numerical error is small against
+    /// its noise, unless the step is given.
+    pub solver: Solver,
+    /// Of steady points: at how many the model does not settle.
+    pub unsettled: usize,
+    /// The compared measures of a run by that solver, in SI.
+    pub measures: Vec<f64>,
+    /// What the fitted run is expected to fulfil.
+    pub verdicts: Vec<Verdict>,
+}
+
 impl Fitted {
-    pub fn new(name: &str, fit: &Fit, answer: Answer, step: f64, level: f64, seconds: f64) -> Fitted {
-        let mut notes = fit.varying.notes.clone();
-        let asks = &fit.asks;
-        if asks.begins != 0.0 {
-            notes.push(format!("time begins at the first row, at {} in the file", abi::format::time(asks.begins)));
+    pub fn new(name: &str, runs: &Runs, answer: Answer, steps: &[f64], level: f64, seconds: f64) -> Fitted {
+        let mut notes: Vec<String> = Vec::new();
+        for part in &runs.parts {
+            notes.extend(part.varying.notes.iter().filter(|note| !notes.contains(note)).cloned().collect::<Vec<_>>());
+            if part.asks.begins != 0.0 {
+                let of = if runs.parts.len() > 1 { format!("{}: ", part.asks.label) } else { String::new() };
+                let begins = abi::format::time(part.asks.begins);
+                notes.push(format!("{of}time begins at the first row, at {begins} in the file"));
+            }
         }
-        let all = asks.unknowns.iter().enumerate();
-        let shown = all.map(|(k, one)| (&one.path, rounded(answer.values[k], answer.sd[k], &one.unit)));
-        let shown: Vec<(&String, String)> = shown.collect();
-        // An instance has arguments of its own, not of its parts.
-        let whole = shown.iter().filter(|(path, _)| !path.contains(['.', '[']));
-        let arguments: Vec<String> = whole.map(|(path, value)| format!("{path} = {value}")).collect();
+        assert_eq!(steps.len(), runs.parts.len(), "a step for each run");
+        let several = runs.parts.len() > 1;
+        let shown = |k: usize| rounded(answer.values[k], answer.sd[k], &runs.unknowns[k].unit);
+        // An instance has arguments of its own, not of its parts, and of all recordings alike.
+        let shared = |k: &usize| !runs.unknowns[*k].own && (!several || runs.unknowns[*k].of.is_none());
+        let all: Vec<usize> = (0..runs.unknowns.len()).filter(shared).collect();
+        let mut instances: Vec<String> = Vec::new();
+        for part in &runs.parts {
+            let is_whole = |k: &&usize| part.asks.slots[**k].is_some() && !runs.unknowns[**k].path.contains(['.', '[']);
+            let arguments = all.iter().filter(is_whole).map(|k| format!("{} = {}", runs.unknowns[*k].path, shown(*k)));
+            let instance = format!("{}({})", part.asks.model, arguments.collect::<Vec<_>>().join(", "));
+            if !instances.contains(&instance) {
+                instances.push(instance);
+            }
+        }
         Fitted {
             name: name.into(),
-            instance: format!("{}({})", asks.model, arguments.join(", ")),
-            set: shown.iter().map(|(path, value)| format!("{path}={value}")).collect(),
-            solver: Solver {
-                step: if asks.solver_given || fit.varying.keeps_past() { step } else { FINER * step },
-                ..fit.varying.experiment.solver
-            },
+            instances,
+            set: all.iter().map(|k| format!("{}={}", runs.unknowns[*k].path, shown(*k))).collect(),
             answer,
-            step,
+            runs: Vec::new(),
             level,
             seconds,
-            unsettled: 0,
             rank: None,
-            measures: Vec::new(),
-            verdicts: Vec::new(),
             notes,
         }
+    }
+
+    pub fn name(&self) -> &str {
+        &self.name
+    }
+
+    /// The solver of the text to go on with, of a run whose search had steps of this length.
+    pub fn solver(&self, part: &Part, step: f64) -> Solver {
+        let given = part.asks.solver_given || part.varying.keeps_past();
+        Solver { step: if given { step } else { FINER * step }, ..part.varying.experiment.solver }
+    }
+
+    /// The solver of the search, where all runs have the same.
+    fn solver_of_all(&self) -> Option<String> {
+        let mut all = self.runs.iter().map(|run| results::solver(&Solver { step: run.step, ..run.solver }));
+        let first = all.next()?;
+        all.all(|other| other == first).then_some(first)
     }
 
     /// Whether the search ended in a minimum.
@@ -93,14 +123,14 @@ impl Fitted {
     }
 
     /// Warnings that the fit does not allow.
-    pub fn warnings(&self, asks: &Asks) -> Vec<Diagnostic> {
+    pub fn warnings(&self, runs: &Runs) -> Vec<Diagnostic> {
         let answer = &self.answer;
         let mut all = Vec::new();
         for open in &answer.undetermined {
             let largest = open.direction.iter().map(|c| c.abs()).fold(0.0, f64::max);
             let parts: Vec<usize> =
                 (0..open.direction.len()).filter(|k| open.direction[*k].abs() >= NAMED * largest).collect();
-            let names: Vec<String> = parts.iter().map(|k| format!("`{}`", asks.unknowns[*k].path)).collect();
+            let names: Vec<String> = parts.iter().map(|k| format!("`{}`", runs.unknowns[*k].label)).collect();
             let message = match &names[..] {
                 [one] => format!("these data do not determine {one}"),
                 [head @ .., last] => format!("these data do not tell {} from {last}", head.join(", ")),
@@ -108,7 +138,7 @@ impl Fitted {
             };
             let mut warning = Diagnostic::warning("W0910", message);
             for k in parts {
-                let unknown = &asks.unknowns[k];
+                let unknown = &runs.unknowns[k];
                 let sd = match is_open(unknown, answer.sd[k]) {
                     true => "not determined".to_string(),
                     false => format!("± {}", show(answer.sd[k], &unknown.unit, 2)),
@@ -119,46 +149,57 @@ impl Fitted {
                 "record a motion in which they act differently, fix one in `run`, or say what is known: `vary Fs = 1.5 N +- 0.1 N`",
             )));
         }
-        for (unknown, at) in asks.unknowns.iter().zip(&answer.at_bound) {
+        for (unknown, at) in runs.unknowns.iter().zip(&answer.at_bound) {
             let Some(upper) = at else { continue };
             let bound = if *upper { unknown.range.1 } else { unknown.range.0 };
-            let message = format!("`{}` ended at the bound of its range", unknown.path);
+            let below = unknown.above.filter(|_| !upper).map(|below| &runs.unknowns[below].label);
+            if let Some(below) = below {
+                let message = format!("`{}` ended at the least that it may be, `{below}`", unknown.label);
+                let warning = Diagnostic::warning("W0902", message).label(unknown.span, format!("not below `{below}`"));
+                all.push((
+                    "at-bound",
+                    warning.help("where both are the same number, fit a law without their difference"),
+                ));
+                continue;
+            }
+            let message = format!("`{}` ended at the bound of its range", unknown.label);
             let warning = Diagnostic::warning("W0902", message).label(unknown.span, show(bound, &unknown.unit, 4));
             all.push(("at-bound", warning.help("widen the range, unless the bound has a reason")));
         }
         for k in &answer.rough {
-            let unknown = &asks.unknowns[*k];
-            let message = format!("how the residuals depend on `{}` is rough", unknown.path);
+            let unknown = &runs.unknowns[*k];
+            let message = format!("how the residuals depend on `{}` is rough", unknown.label);
             let warning =
                 Diagnostic::warning("W0906", message).label(unknown.span, "differences of two sizes disagree");
             all.push(("rough", warning.help(
                 "its standard deviation may be wrong: take a tighter tolerance or a shorter step, or locate events with `solver adaptive`",
             )));
         }
-        if self.unsettled > 0 {
-            let [points, all_points] = [self.unsettled, asks.rows.len()].map(|n| count(n as u64));
+        for (part, run) in runs.parts.iter().zip(&self.runs).filter(|(_, run)| run.unsettled > 0) {
+            let [points, all_points] = [run.unsettled, part.asks.rows.len()].map(|n| count(n as u64));
             let message = format!("the model does not settle at {points} of {all_points} steady points");
             let label = format!("it still moves after {}", duration(HELD, 2));
-            let warning = Diagnostic::warning("W0911", message).label(asks.name, label);
+            let warning = Diagnostic::warning("W0911", message).label(runs.name, label);
             all.push(("unsettled", warning.help(
                 "leave out the points at which the measured contact does not settle either, or fit the recording over time",
             )));
         }
-        all.into_iter().filter(|(lint, _)| !asks.allowed.iter().any(|it| it == lint)).map(|(_, one)| one).collect()
+        all.into_iter().filter(|(lint, _)| !runs.allowed.iter().any(|it| it == lint)).map(|(_, one)| one).collect()
     }
 
-    /// The table of the values, the noise, the verdicts, and the instance to paste.
-    pub fn words(&self, asks: &Asks, terminal: &Terminal) -> String {
+    /// The table of the values, the noise, the verdicts, and the instances to paste.
+    pub fn words(&self, runs: &Runs, terminal: &Terminal) -> String {
         let answer = &self.answer;
-        let unknowns = if asks.unknowns.len() == 1 { "unknown" } else { "unknowns" };
-        let mut out = format!(
-            "  {}: {} {}, {} {unknowns}, {}\n",
-            asks.model,
-            count(asks.rows.len() as u64),
-            if asks.steady { "steady points" } else { "rows" },
-            asks.unknowns.len(),
-            results::solver(&Solver { step: self.step, ..self.solver })
-        );
+        let several = runs.parts.len() > 1;
+        let (n, steady) = (runs.unknowns.len(), runs.parts.iter().all(|part| part.asks.steady));
+        let mut heading =
+            vec![format!("{} {}", count(runs.rows() as u64), if steady { "steady points" } else { "rows" })];
+        if several {
+            heading.insert(0, format!("{} recordings", runs.parts.len()));
+        }
+        heading.push(format!("{n} {}", if n == 1 { "unknown" } else { "unknowns" }));
+        heading.extend(self.solver_of_all());
+        let mut out = format!("  {}: {}\n", models(runs), heading.join(", "));
         let starts = match answer.starts {
             1 => String::new(),
             n => format!("{} starts, {} followed, {} ended here; ", count(n as u64), answer.followed, answer.agreed),
@@ -176,15 +217,15 @@ impl Fitted {
             };
         }
         let percent = significant(100.0 * self.level, 4);
-        let rows: Vec<[String; 4]> = asks
+        let rows: Vec<[String; 4]> = runs
             .unknowns
             .iter()
             .enumerate()
             .map(|(k, unknown)| {
                 let [value, sd, low, high] = self.shown(k, unknown);
                 match low.is_empty() {
-                    true => [unknown.path.clone(), value, sd, "not determined".into()],
-                    false => [unknown.path.clone(), value, format!("± {sd}"), format!("{low} .. {high}")],
+                    true => [unknown.label.clone(), value, sd, "not determined".into()],
+                    false => [unknown.label.clone(), value, format!("± {sd}"), format!("{low} .. {high}")],
                 }
             })
             .collect();
@@ -195,37 +236,53 @@ impl Fitted {
             let level = if k == 0 { format!("   {percent} %") } else { String::new() };
             out += &format!("  {name}  {value}  {sd}  {}{level}\n", row[3]);
         }
-        let n = asks.unknowns.len();
         let pairs = (0..n).flat_map(|i| (0..i).map(move |j| (j, i)));
         let pairs: Vec<String> = pairs
             .filter(|(j, i)| answer.correlation[i * n + j].abs() > CORRELATED)
             .map(|(j, i)| {
-                let [a, b] = [j, i].map(|k| asks.unknowns[k].path.as_str());
+                let [a, b] = [j, i].map(|k| runs.unknowns[k].label.as_str());
                 format!("{a}, {b} {}", significant(answer.correlation[i * n + j], 2))
             })
             .collect();
         if !pairs.is_empty() {
             out += &format!("  correlation above {CORRELATED}: {}\n", pairs.join("; "));
         }
-        for (k, item) in asks.items.iter().enumerate() {
-            let noise = &answer.noise[k];
-            let colour = match noise.order() {
-                0 => "white".to_string(),
-                order => format!("correlated over {order} row{}", if order == 1 { "" } else { "s" }),
-            };
-            let of_given = match item.sd {
-                Some(sd) => format!(", {} of what is given", significant(answer.rms[k] / sd, 3)),
-                None => String::new(),
-            };
-            out += &format!("  rms({})  {}, {colour}{of_given}\n", item.text, show(answer.rms[k], &item.unit, 4));
+        for ((part, run), items) in runs.parts.iter().zip(&self.runs).zip(runs.items()) {
+            let indent = if several { "    " } else { "  " };
+            if several {
+                let solver = match self.solver_of_all() {
+                    Some(_) => String::new(),
+                    None => format!(", {}", results::solver(&Solver { step: run.step, ..run.solver })),
+                };
+                let rows = count(part.asks.rows.len() as u64);
+                let what = if part.asks.steady { "steady points" } else { "rows" };
+                out += &format!("  {}: {rows} {what}{solver}\n", part.asks.label);
+            }
+            for (item, k) in part.asks.items.iter().zip(items) {
+                let noise = &answer.noise[k];
+                let colour = match noise.order() {
+                    0 => "white".to_string(),
+                    order => format!("correlated over {order} row{}", if order == 1 { "" } else { "s" }),
+                };
+                let of_given = match item.sd {
+                    Some(sd) => format!(", {} of what is given", significant(answer.rms[k] / sd, 3)),
+                    None => String::new(),
+                };
+                let rms = show(answer.rms[k], &item.unit, 4);
+                out += &format!("{indent}rms({})  {rms}, {colour}{of_given}\n", item.text);
+            }
+            out += &results::verdicts(terminal, &run.verdicts, None, None, indent);
         }
-        out += &results::verdicts(terminal, &self.verdicts, None, None, "  ");
         for note in &self.notes {
             out += &format!("  note: {note}\n");
         }
-        let parts = asks.unknowns.iter().zip(&self.set).filter(|(unknown, _)| unknown.path.contains(['.', '[']));
-        let set: String = parts.map(|(_, set)| format!(" --set '{set}'")).collect();
-        out + &format!("  {}{set}\n", self.instance)
+        let parts = self.set.iter().filter(|set| set.split('=').next().is_some_and(|path| path.contains(['.', '['])));
+        let set: String = parts.map(|set| format!(" --set '{set}'")).collect();
+        // Without arguments, it has unknowns of the fit itself alone.
+        for instance in self.instances.iter().filter(|instance| !instance.ends_with("()") || !set.is_empty()) {
+            out += &format!("  {instance}{set}\n");
+        }
+        out
     }
 
     /// A value with its unit, then its deviation and the ends of its interval without; these are empty where the data
@@ -241,11 +298,11 @@ impl Fitted {
     }
 
     /// The object of `--json`. Each value is in the unit beside it.
-    pub fn json(&self, file: &Path, asks: &Asks, (recording, hash): &(PathBuf, String)) -> Value {
+    pub fn json(&self, file: &Path, runs: &Runs, recordings: &[(PathBuf, String)]) -> Value {
         let answer = &self.answer;
-        let n = asks.unknowns.len();
+        let n = runs.unknowns.len();
         let width = |unit: &Unit, si: f64| number(unit.from_si(si) - unit.from_si(0.0));
-        let parameters: Vec<Value> = asks
+        let parameters: Vec<Value> = runs
             .unknowns
             .iter()
             .enumerate()
@@ -254,6 +311,8 @@ impl Fitted {
                 let of = |si: f64| number(one.unit.from_si(si));
                 json!({
                     "path": one.path,
+                    "initial": one.initial,
+                    "recording": one.of.map(|of| runs.parts[of].asks.label.clone()),
                     "value": of(answer.values[k]),
                     "sd": width(&one.unit, answer.sd[k]),
                     "interval": [of(low), of(high)],
@@ -265,19 +324,30 @@ impl Fitted {
                 })
             })
             .collect();
-        let compared: Vec<Value> = asks
-            .items
-            .iter()
-            .enumerate()
-            .map(|(k, item)| {
-                let noise = &answer.noise[k];
+        let compared = |(item, k): (&FitItem, usize)| {
+            json!({
+                "text": item.text,
+                "rms": width(&item.unit, answer.rms[k]),
+                "given_sd": item.sd.map(|sd| width(&item.unit, sd)),
+                "unit": item.unit.text,
+                "rows": answer.residuals[k].len(),
+                "autoregression": answer.noise[k].coefficients.iter().map(|a| number(*a)).collect::<Vec<_>>(),
+            })
+        };
+        let each = runs.parts.iter().zip(&self.runs).zip(recordings).zip(runs.items());
+        let recordings: Vec<Value> = each
+            .map(|(((part, run), (recording, hash)), items)| {
                 json!({
-                    "text": item.text,
-                    "rms": width(&item.unit, answer.rms[k]),
-                    "given_sd": item.sd.map(|sd| width(&item.unit, sd)),
-                    "unit": item.unit.text,
-                    "rows": answer.residuals[k].len(),
-                    "autoregression": noise.coefficients.iter().map(|a| number(*a)).collect::<Vec<_>>(),
+                    "label": part.asks.label,
+                    "file": recording.display().to_string(),
+                    "sha256": hash,
+                    "model": part.asks.model,
+                    "rows": part.asks.rows.len(),
+                    "steady": part.asks.steady,
+                    "begins": number(part.asks.begins),
+                    "solver": results::solver(&Solver { step: run.step, ..run.solver }),
+                    "compared": part.asks.items.iter().zip(items).map(compared).collect::<Vec<_>>(),
+                    "expects": run.verdicts.iter().map(results::verdict_json).collect::<Vec<_>>(),
                 })
             })
             .collect();
@@ -285,8 +355,9 @@ impl Fitted {
             .undetermined
             .iter()
             .map(|open| {
+                let each = runs.unknowns.iter().zip(&open.direction);
                 let direction: serde_json::Map<String, Value> =
-                    asks.unknowns.iter().zip(&open.direction).map(|(one, c)| (one.path.clone(), number(*c))).collect();
+                    each.map(|(one, c)| (one.label.clone(), number(*c))).collect();
                 json!({ "sensitivity": number(open.sensitivity), "direction": direction })
             })
             .collect();
@@ -294,33 +365,33 @@ impl Fitted {
         json!({
             "file": file.display().to_string(),
             "fit": self.name,
-            "recording": recording.display().to_string(),
-            "sha256": hash,
-            "model": asks.model,
+            "model": models(runs),
+            "recordings": recordings,
             "converged": self.converged(),
-            "passed": self.verdicts.iter().all(Verdict::passed),
+            "passed": self.runs.iter().flat_map(|run| &run.verdicts).all(Verdict::passed),
             "level": self.level,
             "parameters": parameters,
             "correlation": (0..n).map(row).collect::<Vec<_>>(),
             "undetermined": open,
-            "compared": compared,
             "chi_square": number(answer.chi_square),
             "degrees_of_freedom": number(answer.degrees),
-            "rows": asks.rows.len(),
-            "steady": asks.steady,
-            "begins": number(asks.begins),
-            "solver": results::solver(&Solver { step: self.step, ..self.solver }),
             "rank": self.rank.map(|(rank, _)| rank),
-            "held_out_rms": self.rank.map(|(_, rms)| width(&asks.items[0].unit, rms)),
+            "held_out_rms": self.rank.map(|(_, rms)| width(&runs.parts[0].asks.items[0].unit, rms)),
             "starts": { "judged": answer.starts, "followed": answer.followed, "ended_here": answer.agreed },
             "runs": answer.runs,
             "failures": answer.failures.iter().map(|(why, n)| (why.clone(), json!(n))).collect::<serde_json::Map<_, _>>(),
-            "expects": self.verdicts.iter().map(results::verdict_json).collect::<Vec<_>>(),
-            "instance": self.instance,
+            "instances": self.instances,
             "set": self.set,
             "notes": self.notes,
         })
     }
+}
+
+/// The models that are run, each once.
+fn models(runs: &Runs) -> String {
+    let mut models: Vec<&str> = runs.parts.iter().map(|part| &part.asks.model[..]).collect();
+    models.dedup();
+    models.join(", ")
 }
 
 /// Whether a standard deviation is as wide as the range: then the data say nothing.
@@ -350,12 +421,17 @@ fn rounded(si: f64, sd: f64, unit: &Unit) -> String {
 }
 
 /// The differences with the values as they are written.
-pub fn as_written(asks: &Asks, residuals: &[Vec<f64>]) -> String {
-    let one = |(item, rows): (&FitItem, &Vec<f64>)| {
-        let rms = (rows.iter().map(|r| r * r).sum::<f64>() / rows.len().max(1) as f64).sqrt();
-        format!("  rms({})  {}, {} rows\n", item.text, show(rms, &item.unit, 4), count(rows.len() as u64))
-    };
-    asks.items.iter().zip(residuals).map(one).collect()
+pub fn as_written(runs: &Runs, residuals: &[Vec<f64>]) -> String {
+    let mut out = String::new();
+    for (part, items) in runs.parts.iter().zip(runs.items()) {
+        let of = if runs.parts.len() > 1 { format!("{}: ", part.asks.label) } else { String::new() };
+        for (item, rows) in part.asks.items.iter().zip(&residuals[items]) {
+            let rms = (rows.iter().map(|r| r * r).sum::<f64>() / rows.len().max(1) as f64).sqrt();
+            let rows = count(rows.len() as u64);
+            out += &format!("  {of}rms({})  {}, {rows} rows\n", item.text, show(rms, &item.unit, 4));
+        }
+    }
+    out
 }
 
 /// The compared rows as CSV: time, or the number of the steady point, then each difference with its two sides.

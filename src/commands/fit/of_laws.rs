@@ -16,7 +16,7 @@ use std::time::Instant;
 pub fn of_laws(args: &args::Fit, terminal: &mut Terminal) -> End {
     let mut watch = Stopwatch::start("read");
     let name = args.file.display().to_string();
-    if args.check || args.data.is_some() {
+    if args.check || !args.data.is_empty() {
         terminal.error(&format!("{name} is a recording; `--check` and `--data` belong to a text with a fit"));
         return End::Misused;
     }
@@ -61,11 +61,11 @@ pub fn of_laws(args: &args::Fit, terminal: &mut Terminal) -> End {
         let runs = Runs::new(compiled);
         let found = search(&runs, Settings::of(args));
         let held_out = found.as_ref().ok().and_then(|found| held_out(&runs, found, Settings::of(args)));
-        let contender = Contender { parameters: runs.fit.asks.unknowns.len(), held_out };
+        let contender = Contender { parameters: runs.unknowns.len(), held_out };
         tried.push(Tried { name, runs, found, contender, seconds: begin.elapsed().as_secs_f64() });
     }
     let contenders: Vec<Contender> = tried.iter().map(|one| one.contender.clone()).collect();
-    let steady = tried.first().is_some_and(|one| one.runs.fit.asks.steady);
+    let steady = tried.first().is_some_and(|one| one.runs.parts[0].asks.steady);
     let ranks = ranking::ranks(&contenders, steady);
     if !args.json && !args.quiet {
         terminal.print(&ranked(&name, &tried, &ranks));
@@ -79,13 +79,13 @@ pub fn of_laws(args: &args::Fit, terminal: &mut Terminal) -> End {
         match found {
             Ok(found) => {
                 let rank = Some((*rank, contender.held_out.as_deref().map_or(f64::NAN, rms)));
-                let question = Asked { args, file: &place, data: None, loaded: &loaded, name, rank };
+                let question = Asked { args, file: &place, data: &[], loaded: &loaded, name, rank };
                 if conclude(&question, runs, found.clone(), *seconds, terminal) != End::Fine && k == best {
                     end = End::Failed;
                 }
             }
             Err(trouble) => {
-                reported(&loaded, &[told(trouble, &runs.fit.asks)], terminal);
+                reported(&loaded, &[told(trouble, runs)], terminal);
                 end = End::Failed;
             }
         }
@@ -104,20 +104,20 @@ struct Tried {
 
 /// The table of the laws in their order.
 fn ranked(name: &str, tried: &[Tried], ranks: &[(usize, usize)]) -> String {
-    let asks = &tried[0].runs.fit.asks;
+    let asks = &tried[0].runs.parts[0].asks;
     let rows = if asks.steady { "steady points" } else { "rows" };
     let mut out = format!("{name}: {} {rows}\n", count(asks.rows.len() as u64));
     let mut table = vec![["", "law", "parameters", "rms", "held out"].map(str::to_string)];
     for (k, rank) in ranks {
         let Tried { runs, found, contender, .. } = &tried[*k];
-        let unit = &runs.fit.asks.items[0].unit;
+        let unit = &runs.parts[0].asks.items[0].unit;
         let seen = match found {
             Ok((answer, ..)) => show(rms(&answer.residuals[0]), unit, 4),
-            Err(trouble) => told(trouble, &runs.fit.asks).message,
+            Err(trouble) => told(trouble, runs).message,
         };
         let held_out = contender.held_out.as_deref().map_or(String::new(), |rows| show(rms(rows), unit, 4));
         let parameters = contender.parameters.to_string();
-        table.push([rank.to_string(), runs.fit.asks.model.clone(), parameters, seen, held_out]);
+        table.push([rank.to_string(), runs.parts[0].asks.model.clone(), parameters, seen, held_out]);
     }
     let width = |column: usize| table.iter().map(|row| row[column].chars().count()).max().unwrap_or(0);
     let widths = [0, 1, 2, 3, 4].map(width);

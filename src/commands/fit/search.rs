@@ -3,13 +3,15 @@
 //! In: a compiled fit. Out: what its runs leave of the recording, and an answer with the step that it needs. Knows nothing
 //! of files.
 
-use crate::args;
-use crate::compile::{self, ElementaryFunction, HELD};
+use crate::args::{self, STARTS, STARTS_WITH_REGIMES};
+use crate::compile::{self, ElementaryFunction, HELD, Varying};
 use crate::quantity::{duration, significant};
 use abi::plan::{Experiment, Method};
 use abi::{Instance, Slot};
+use grammar::span::Span;
 use runtime::engine::{self, Cause, Continue, Failure, lanes};
-use runtime::fit::{Answer, Elementary, Item, Question, Trouble, Unknown, ranking};
+use runtime::fit::{Answer, Elementary, Item, Minima, Question, Trouble, Unknown, Way, ranking};
+use std::ops::Range;
 
 /// Most trial points of a stage of the search.
 const TRIALS: u32 = 100;
@@ -17,56 +19,132 @@ const TRIALS: u32 = 100;
 const PART_OF_NOISE: f64 = 0.1;
 /// How often a step is halved at most.
 const MOST_HALVINGS: u32 = 8;
+/// Tolerance of runs that are held to their recording, which follow its noise.
+const HELD_TOL: f64 = 1e-5;
 
 /// The compiled fit and its rows.
 pub struct Runs {
-    /// The fit.
-    pub fit: compile::Fit,
+    /// Each recording of each case.
+    pub parts: Vec<Part>,
+    /// The unknown parameters.
+    pub unknowns: Vec<compile::FitUnknown>,
+    /// The name of the fit.
+    pub name: Span,
+    /// Lints that the fit allows.
+    pub allowed: Vec<String>,
+}
+
+/// The runs against one recording.
+pub struct Part {
+    /// Runs under other values.
+    pub varying: Varying,
+    /// What is asked.
+    pub asks: compile::Asks,
     /// The compared rows, in s.
     pub instants: Vec<f64>,
     /// The compared quantities.
     pub slots: Vec<Slot>,
+    held: Option<Held>,
+}
+
+/// Runs that an observer holds to the recording.
+struct Held {
+    varying: Varying,
+    /// The slot of its pole.
+    pole: Slot,
+    /// The compared quantities.
+    slots: Vec<Slot>,
 }
 
 /// Values of a run at its rows, or why it failed.
 pub type Residuals = Result<Vec<Vec<f64>>, String>;
 
-impl Runs {
-    /// The runs of a fit.
-    pub fn new(mut fit: compile::Fit) -> Runs {
-        // The last plot holds the compared quantities.
-        fit.varying.plots.pop();
-        let (after, before) = fit.asks.window;
-        let instants = fit.asks.rows.iter().copied().filter(|t| (after..=before).contains(t)).collect();
-        let slots = fit.asks.items.iter().map(|item| item.slot).collect();
-        Runs { fit, instants, slots }
+impl Part {
+    fn new(part: compile::FitPart) -> Part {
+        let compile::FitPart { mut varying, held, asks } = part;
+        // The last plot holds the compared quantities, each followed by its two sides.
+        varying.plots.pop();
+        let mut at = 0;
+        let places = asks.items.iter().map(|item| {
+            let place = at;
+            at += if item.sides.is_some() { 3 } else { 1 };
+            place
+        });
+        let places: Vec<usize> = places.collect();
+        let held = held.and_then(|(varying, pole)| {
+            let series = &varying.plots.last()?.series;
+            let slots = places.iter().map(|place| series[*place].slot).collect();
+            Some(Held { varying, pole, slots })
+        });
+        let (after, before) = asks.window;
+        let instants = asks.rows.iter().copied().filter(|t| (after..=before).contains(t)).collect();
+        let slots = asks.items.iter().map(|item| item.slot).collect();
+        Part { varying, asks, instants, slots, held }
     }
 
     /// The step as the text has it, in s; 0 for an adaptive run.
     pub fn step(&self) -> f64 {
-        self.fit.varying.experiment.solver.step
+        self.varying.experiment.solver.step
     }
 
-    /// An instance and a plan for these values, with steps of this length.
+    /// Whether the step is not the search's to choose.
+    fn is_fixed(&self) -> bool {
+        let adaptive = self.varying.experiment.solver.method == Method::Adaptive;
+        self.asks.solver_given || adaptive || self.varying.keeps_past()
+    }
+
+    /// The values on which a run against this recording depends.
+    fn own(&self, values: &[f64]) -> Vec<(Slot, f64)> {
+        self.asks.slots.iter().zip(values).filter_map(|(slot, value)| Some(((*slot)?, *value))).collect()
+    }
+
+    /// An instance and a plan for these values of all unknowns, with steps of this length.
     pub fn with(&self, values: &[f64], step: f64) -> Result<(Instance, Experiment), String> {
-        let given: Vec<(Slot, f64)> =
-            self.fit.asks.unknowns.iter().zip(values).map(|(unknown, value)| (unknown.slot, *value)).collect();
-        let made = self.fit.varying.at(&given)?;
+        self.made(Way::Whole, &self.own(values), step, &[])
+    }
+
+    fn made(
+        &self,
+        way: Way,
+        given: &[(Slot, f64)],
+        step: f64,
+        instants: &[f64],
+    ) -> Result<(Instance, Experiment), String> {
+        let held = |pole: f64| {
+            let held = self.held.as_ref()?;
+            let rows = &self.asks.rows;
+            let interval = (rows[rows.len() - 1] - rows[0]) / (rows.len() - 1).max(1) as f64;
+            Some((held, [given, &[(held.pole, pole / interval)]].concat()))
+        };
+        let made = match way {
+            Way::Held(pole) => {
+                let (held, given) = held(pole).ok_or("no state is compared")?;
+                held.varying.at(&given)?
+            }
+            Way::Whole | Way::First(_) => self.varying.at(given)?,
+        };
         let mut experiment = made.experiment;
         match experiment.solver.method {
-            Method::Adaptive if self.fit.asks.driven => {
+            Method::Adaptive if matches!(way, Way::Held(_)) => {
+                experiment.solver.tol = experiment.solver.tol.max(HELD_TOL)
+            }
+            Method::Adaptive if self.asks.driven => {
                 let end = experiment.duration;
-                experiment.corners.extend(self.fit.asks.corners.iter().filter(|t| **t > 0.0 && **t < end));
+                experiment.corners.extend(self.asks.corners.iter().filter(|t| **t > 0.0 && **t < end));
                 experiment.corners.sort_by(f64::total_cmp);
                 experiment.corners.dedup();
             }
             Method::Adaptive => {}
             _ => experiment.solver.step = step,
         }
+        if let (Way::First(_), Some(last)) = (way, instants.last()) {
+            experiment.duration = *last;
+            experiment.corners.retain(|t| t < last);
+        }
         Ok((made.instance, experiment))
     }
 
-    /// Values of the slots at these instants for each of these sets of values: in lanes if there are enough to fill them.
+    /// Values of the slots at these instants for each of these sets of values of all unknowns.
     pub fn sampled(
         &self,
         points: &[Vec<f64>],
@@ -74,10 +152,23 @@ impl Runs {
         instants: &[f64],
         slots: &[Slot],
     ) -> Vec<Result<Vec<f64>, String>> {
+        let points: Vec<Vec<(Slot, f64)>> = points.iter().map(|values| self.own(values)).collect();
+        self.sampled_of(Way::Whole, &points, step, instants, slots)
+    }
+
+    /// The same for sets of values of the slots: in lanes if there are enough to fill them.
+    fn sampled_of(
+        &self,
+        way: Way,
+        points: &[Vec<(Slot, f64)>],
+        step: f64,
+        instants: &[f64],
+        slots: &[Slot],
+    ) -> Vec<Result<Vec<f64>, String>> {
         let mut out: Vec<Option<Result<Vec<f64>, String>>> = points.iter().map(|_| None).collect();
         let (mut places, mut all) = (Vec::new(), Vec::new());
-        for (place, values) in points.iter().enumerate() {
-            match self.with(values, step) {
+        for (place, given) in points.iter().enumerate() {
+            match self.made(way, given, step, instants) {
                 Ok(made) => {
                     places.push(place);
                     all.push(made);
@@ -86,7 +177,11 @@ impl Runs {
             }
         }
         let watch = &mut |_| Continue::Continue(());
-        let results = match self.fit.varying.lanes().filter(|lanes| all.len() >= lanes.width() / 2) {
+        let varying = match (way, &self.held) {
+            (Way::Held(_), Some(held)) => &held.varying,
+            _ => &self.varying,
+        };
+        let results = match varying.lanes().filter(|lanes| all.len() >= lanes.width() / 2) {
             Some(code) => lanes::sample(code, all, instants, slots, watch),
             None => {
                 let mut one = |(instance, experiment): (Instance, Experiment)| {
@@ -107,34 +202,34 @@ impl Runs {
         out.into_iter().map(|one| one.expect("each was run or refused")).collect()
     }
 
-    /// The search's view of what is asked, from these starts.
-    fn asked(&self, starts: &[f64]) -> (Vec<Unknown>, Vec<Item>) {
-        let unknown = |(one, start): (&compile::FitUnknown, &f64)| Unknown {
-            low: one.range.0,
-            high: one.range.1,
-            start: *start,
-            known: one.known,
+    /// Compared minus recorded at these rows, for each of these sets of values of all unknowns. Values on which this
+    /// recording does not depend cost no run.
+    fn residuals_at(&self, way: Way, points: &[Vec<f64>], step: f64, instants: &[f64]) -> Vec<Residuals> {
+        let slots = match (way, &self.held) {
+            (Way::Held(_), Some(held)) => &held.slots,
+            _ => &self.slots,
         };
-        let asks = &self.fit.asks;
-        let items = asks.items.iter().map(|item| Item { sd: item.sd });
-        (asks.unknowns.iter().zip(starts).map(unknown).collect(), items.collect())
-    }
-
-    /// Compared minus recorded, at the compared rows, for each of these sets of values.
-    pub fn residuals(&self, points: &[Vec<f64>], step: f64) -> Vec<Residuals> {
-        self.residuals_at(points, step, &self.instants)
-    }
-
-    fn residuals_at(&self, points: &[Vec<f64>], step: f64, instants: &[f64]) -> Vec<Residuals> {
-        let width = self.slots.len();
+        let width = slots.len();
         let split = |values: Vec<f64>| -> Residuals {
             if let Some(bad) = values.iter().position(|value| !value.is_finite()) {
-                let item = &self.fit.asks.items[bad % width];
+                let item = &self.asks.items[bad % width];
                 return Err(format!("`{}` is not a finite number", item.text));
             }
             Ok((0..width).map(|k| values.iter().skip(k).step_by(width).copied().collect()).collect())
         };
-        self.sampled(points, step, instants, &self.slots).into_iter().map(|one| one.and_then(split)).collect()
+        let mut different: Vec<Vec<(Slot, f64)>> = Vec::new();
+        let place = |values: &Vec<f64>| {
+            let own = self.own(values);
+            let found = different.iter().position(|other| *other == own);
+            found.unwrap_or_else(|| {
+                different.push(own);
+                different.len() - 1
+            })
+        };
+        let places: Vec<usize> = points.iter().map(place).collect();
+        let found = self.sampled_of(way, &different, step, instants, slots);
+        let found: Vec<Residuals> = found.into_iter().map(|one| one.and_then(split)).collect();
+        places.into_iter().map(|place| found[place].clone()).collect()
     }
 
     /// The compared measures of a run with steps of this length, in SI: integrals over time, unlike sums over rows.
@@ -143,22 +238,102 @@ impl Runs {
         let Ok(outcome) = engine::run(instance, &experiment, &mut |_| Continue::Continue(())) else {
             return Vec::new();
         };
-        let end = self.fit.varying.expects();
+        let end = self.varying.expects();
         let shown = outcome.verdicts[end - self.slots.len()..end].iter();
         shown.filter_map(|verdict| verdict.shown.as_ref().map(|shown| shown.value)).collect()
     }
 
     /// The number of steady points at which a compared quantity still moved by a noticeable part of its residuals in
-    /// the second half of the hold.
-    pub fn unsettled(&self, answer: &Answer) -> usize {
+    /// the second half of the hold. `rms`: the residuals of its compared quantities.
+    pub fn unsettled(&self, values: &[f64], rms: &[f64]) -> usize {
         let pairs: Vec<f64> = self.instants.iter().flat_map(|t| [t - 0.5 * HELD, *t]).collect();
-        let point = std::slice::from_ref(&answer.values);
-        let Ok(values) = self.sampled(point, self.step(), &pairs, &self.slots).remove(0) else { return 0 };
+        let Ok(values) = self.sampled(&[values.to_vec()], self.step(), &pairs, &self.slots).remove(0) else { return 0 };
         let width = self.slots.len();
-        let moves =
-            |pair: &&[f64]| (0..width).any(|k| (pair[k] - pair[width + k]).abs() > PART_OF_NOISE * answer.rms[k]);
+        let moves = |pair: &&[f64]| (0..width).any(|k| (pair[k] - pair[width + k]).abs() > PART_OF_NOISE * rms[k]);
         values.chunks(2 * width).filter(moves).count()
     }
+}
+
+impl Runs {
+    /// The runs of a fit.
+    pub fn new(fit: compile::Fit) -> Runs {
+        let compile::Fit { parts, unknowns, name, allowed } = fit;
+        Runs { parts: parts.into_iter().map(Part::new).collect(), unknowns, name, allowed }
+    }
+
+    /// The steps as the text has them.
+    pub fn steps(&self) -> Vec<f64> {
+        self.parts.iter().map(Part::step).collect()
+    }
+
+    /// The compared quantities of each part, among all.
+    pub fn items(&self) -> Vec<Range<usize>> {
+        let mut begin = 0;
+        let one = |part: &Part| {
+            begin += part.slots.len();
+            begin - part.slots.len()..begin
+        };
+        self.parts.iter().map(one).collect()
+    }
+
+    /// Number of compared rows.
+    pub fn rows(&self) -> usize {
+        self.parts.iter().map(|part| part.asks.rows.len()).sum()
+    }
+
+    /// The search's view of what is asked, from these starts.
+    fn asked(&self, starts: &[f64]) -> (Vec<Unknown>, Vec<Item>) {
+        let unknown = |(one, start): (&compile::FitUnknown, &f64)| Unknown {
+            low: one.range.0,
+            high: one.range.1,
+            start: *start,
+            known: one.known,
+            above: one.above,
+        };
+        let items = self
+            .parts
+            .iter()
+            .flat_map(|part| part.asks.items.iter().map(|item| Item { sd: item.sd, independent: part.asks.steady }));
+        (self.unknowns.iter().zip(starts).map(unknown).collect(), items.collect())
+    }
+
+    /// What is known of other minima.
+    fn minima(&self) -> Minima {
+        Minima {
+            held: self.parts.iter().any(|part| part.held.is_some()),
+            driven: self.parts.iter().all(|part| part.asks.driven),
+            regimes: self.parts.iter().any(|part| part.asks.regimes && !part.asks.driven),
+        }
+    }
+
+    /// Compared minus recorded, at the compared rows, for each of these sets of values.
+    pub fn residuals(&self, way: Way, points: &[Vec<f64>], steps: &[f64]) -> Vec<Residuals> {
+        let rows = |part: &Part| match way {
+            Way::Whole | Way::Held(_) => part.instants.len(),
+            Way::First(share) => ((share * part.instants.len() as f64).ceil() as usize).clamp(1, part.instants.len()),
+        };
+        let of = |(part, step): (&Part, &f64)| match (way, &part.held) {
+            // A recording to which no run can be held counts as it is.
+            (Way::Held(_), None) => part.residuals_at(Way::Whole, points, *step, &part.instants),
+            _ => part.residuals_at(way, points, *step, &part.instants[..rows(part)]),
+        };
+        joined(points.len(), self.parts.iter().zip(steps).map(of))
+    }
+}
+
+/// The residuals of several recordings together.
+fn joined(points: usize, parts: impl Iterator<Item = Vec<Residuals>>) -> Vec<Residuals> {
+    let mut out: Vec<Residuals> = vec![Ok(Vec::new()); points];
+    for part in parts {
+        for (all, one) in out.iter_mut().zip(part) {
+            match (&mut *all, one) {
+                (Ok(all), Ok(one)) => all.extend(one),
+                (Ok(_), Err(why)) => *all = Err(why),
+                (Err(_), _) => {}
+            }
+        }
+    }
+    out
 }
 
 /// The cause of a failure without its numbers, so that equal causes count together.
@@ -178,8 +353,8 @@ fn cause(failure: &Failure) -> String {
 pub struct Settings {
     /// Probability of the intervals.
     pub level: f64,
-    /// Number of starts that are judged.
-    pub starts: usize,
+    /// Number of starts that are judged, if it is given.
+    pub starts: Option<usize>,
     /// Seed of those that are not written.
     pub seed: u64,
 }
@@ -191,8 +366,8 @@ impl Settings {
     }
 }
 
-/// An answer, the step of its runs, and what is to be said of it.
-pub type Found = (Answer, f64, Option<String>);
+/// An answer, the steps of its runs, and what is to be said of it.
+pub type Found = (Answer, Vec<f64>, Option<String>);
 
 /// Estimates the unknowns from some rows.
 fn estimate(
@@ -200,87 +375,91 @@ fn estimate(
     unknowns: &[Unknown],
     items: &[Item],
     settings: Settings,
-    run: &mut dyn FnMut(&[Vec<f64>]) -> Vec<Residuals>,
+    run: &mut dyn FnMut(Way, &[Vec<f64>]) -> Vec<Residuals>,
 ) -> Result<Answer, Trouble> {
     let (exp, log) = (ElementaryFunction::exp(), ElementaryFunction::log());
     runtime::fit::fit(Question {
         unknowns,
         items,
-        independent: runs.fit.asks.steady,
+        minima: runs.minima(),
         run,
         with: Elementary { exp: &|x| exp.at(x), log: &|x| log.at(x) },
         level: settings.level,
         trials: TRIALS,
-        starts: settings.starts,
+        starts: settings.starts.unwrap_or(if runs.minima().regimes { STARTS_WITH_REGIMES } else { STARTS }),
         seed: settings.seed,
     })
 }
 
-/// Searches with the step of the text, and again with half of it until that changes nothing that matters.
+/// Searches with the steps of the text, and again with half of those of which half moves a residual noticeably.
 pub fn search(runs: &Runs, settings: Settings) -> Result<Found, Trouble> {
-    let asks = &runs.fit.asks;
-    let written: Vec<f64> = asks.unknowns.iter().map(|one| one.start).collect();
+    let written: Vec<f64> = runs.unknowns.iter().map(|one| one.start).collect();
     let (mut unknowns, items) = runs.asked(&written);
-    let mut step = runs.step();
+    let mut steps = runs.steps();
     let mut spent = 0;
     let mut judged = None;
     for halvings in 0.. {
-        let mut run = |points: &[Vec<f64>]| runs.residuals(points, step);
-        let starts = if judged.is_none() { settings.starts } else { 1 };
-        let settings = Settings { starts, ..settings };
-        let mut answer = estimate(runs, &unknowns, &items, settings, &mut run)?;
+        let mut run = |way: Way, points: &[Vec<f64>]| runs.residuals(way, points, &steps);
+        let starts = if judged.is_none() { settings.starts } else { Some(1) };
+        let mut answer = estimate(runs, &unknowns, &items, Settings { starts, ..settings }, &mut run)?;
         // Later searches continue from where the first one ended.
         let (starts, followed, agreed) = *judged.get_or_insert((answer.starts, answer.followed, answer.agreed));
         (answer.starts, answer.followed, answer.agreed) = (starts, followed, agreed);
         answer.runs += spent;
-        let solver = runs.fit.varying.experiment.solver.method;
-        let fixed = asks.solver_given || solver == Method::Adaptive || runs.fit.varying.keeps_past();
-        if fixed {
-            return Ok((answer, step, None));
-        }
-        let finer = runs.residuals(&[answer.values.clone()], 0.5 * step).remove(0);
-        let moved = finer.as_ref().map(|finer| {
-            let one = |(k, (a, b)): (usize, (&Vec<f64>, &Vec<f64>))| {
-                let noise = answer.noise[k].variance.sqrt();
-                a.iter().zip(b).map(|(a, b)| (a - b).abs() / noise).fold(0.0, f64::max)
-            };
-            finer.iter().zip(&answer.residuals).enumerate().map(one).fold(0.0, f64::max)
-        });
-        match moved {
-            Ok(moved) if moved <= PART_OF_NOISE => return Ok((answer, step, None)),
-            Ok(_) if halvings < MOST_HALVINGS => {
-                step *= 0.5;
-                spent = answer.runs + 1;
-                for (unknown, value) in unknowns.iter_mut().zip(&answer.values) {
-                    unknown.start = *value;
-                }
+        let mut too_long: Vec<(usize, Result<f64, String>)> = Vec::new();
+        for (k, (part, items)) in runs.parts.iter().zip(runs.items()).enumerate() {
+            if part.is_fixed() {
+                continue;
             }
-            moved => {
-                let by = moved.map_or_else(
-                    |why| why.clone(),
-                    |moved| format!("half of it moves a residual by {} of the noise", significant(moved, 2)),
-                );
-                let note = format!("steps of {} may be too long: {by}", duration(step, 3));
-                return Ok((answer, step, Some(note)));
+            let point = std::slice::from_ref(&answer.values);
+            let finer = part.residuals_at(Way::Whole, point, 0.5 * steps[k], &part.instants).remove(0);
+            let moved = finer.map(|finer| {
+                let one = |(finer, item): (&Vec<f64>, usize)| {
+                    let noise = answer.noise[item].variance.sqrt();
+                    let pairs = finer.iter().zip(&answer.residuals[item]);
+                    pairs.map(|(a, b)| (a - b).abs() / noise).fold(0.0, f64::max)
+                };
+                finer.iter().zip(items).map(one).fold(0.0, f64::max)
+            });
+            spent = answer.runs + 1;
+            if !moved.as_ref().is_ok_and(|moved| *moved <= PART_OF_NOISE) {
+                too_long.push((k, moved));
             }
         }
+        let failed = too_long.iter().find(|(_, moved)| moved.is_err());
+        let Some((k, moved)) = failed.or(too_long.first()) else { return Ok((answer, steps, None)) };
+        if failed.is_none() && halvings < MOST_HALVINGS {
+            for (k, _) in &too_long {
+                steps[*k] *= 0.5;
+            }
+            for (unknown, value) in unknowns.iter_mut().zip(&answer.values) {
+                unknown.start = *value;
+            }
+            continue;
+        }
+        let by = match moved {
+            Err(why) => why.clone(),
+            Ok(moved) => format!("half of it moves a residual by {} of the noise", significant(*moved, 2)),
+        };
+        let note = format!("steps of {} may be too long: {by}", duration(steps[*k], 3));
+        return Ok((answer, steps, Some(note)));
     }
     unreachable!("the loop returns")
 }
 
-/// What a law leaves of each row when it is fitted to the rows of the other half.
-pub fn held_out(runs: &Runs, (answer, step, _): &Found, settings: Settings) -> Option<Vec<f64>> {
-    let asks = &runs.fit.asks;
-    let rows = runs.instants.len();
-    let half = |row: usize| ranking::piece(row, rows, asks.steady) % 2;
+/// What a law leaves of each row of its first recording when it is fitted to the rows of the other half.
+pub fn held_out(runs: &Runs, (answer, steps, _): &Found, settings: Settings) -> Option<Vec<f64>> {
+    let part = &runs.parts[0];
+    let rows = part.instants.len();
+    let half = |row: usize| ranking::piece(row, rows, part.asks.steady) % 2;
     let mut out = vec![0.0; rows];
     for seen in [0, 1] {
-        let instants: Vec<f64> = (0..rows).filter(|row| half(*row) == seen).map(|row| runs.instants[row]).collect();
-        let of_half = |points: &[Vec<f64>]| runs.residuals_at(points, *step, &instants);
+        let instants: Vec<f64> = (0..rows).filter(|row| half(*row) == seen).map(|row| part.instants[row]).collect();
+        let of_half = |_: Way, points: &[Vec<f64>]| part.residuals_at(Way::Whole, points, steps[0], &instants);
         let (unknowns, items) = runs.asked(&answer.values);
         let values =
-            estimate(runs, &unknowns, &items, Settings { starts: 1, ..settings }, &mut { of_half }).ok()?.values;
-        let all = runs.residuals(&[values], *step).remove(0).ok()?;
+            estimate(runs, &unknowns, &items, Settings { starts: Some(1), ..settings }, &mut { of_half }).ok()?.values;
+        let all = runs.residuals(Way::Whole, &[values], steps).remove(0).ok()?;
         (0..rows).filter(|row| half(*row) != seen).for_each(|row| out[row] = all[0][row]);
     }
     Some(out)

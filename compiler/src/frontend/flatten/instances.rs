@@ -324,6 +324,28 @@ impl<'a> Flattener<'a> {
         self.bind(id, &name.text, Binding::Var(var));
     }
 
+    /// Adds a parameter of the root beside its own; returns its name with a node that reads it.
+    pub(super) fn declare_unknown(&mut self, declared: &Declared) -> (String, ExprId) {
+        let (name, unit, place) = (&declared.name, declared.unit.clone(), declared.name.span);
+        let number = Node::Number { value: declared.value, dimension: Some(unit.dimension), angle: unit.angle };
+        let value = self.system.push(number, place);
+        let var = self.add_var(Var {
+            path: declared.path.clone(),
+            name: name.text.clone(),
+            span: place,
+            instance: InstanceId(0),
+            kind: VarKind::Param,
+            unit: Some((unit, place)),
+            unreadable: false,
+            shown: None,
+            range: VarRange::default(),
+            range_span: None,
+            definition: Definition::Value(value, Origin::Default),
+            doc: None,
+        });
+        (name.text.clone(), self.system.push(Node::Var(var), place))
+    }
+
     pub(super) fn add_var(&mut self, var: Var) -> VarId {
         self.system.vars.push(var);
         VarId(self.system.vars.len() as u32 - 1)

@@ -57,6 +57,21 @@ pub struct Request<'a> {
     pub data: Vec<(String, Table, Unit)>,
     /// The rig around the instance.
     pub frame: Option<Frame<'a>>,
+    /// Parameters beside those of the instance, which its arguments may name.
+    pub unknowns: Vec<Declared>,
+}
+
+/// A parameter that a fit declares.
+#[derive(Clone, Debug)]
+pub struct Declared {
+    /// Its name, as arguments read it.
+    pub name: Name,
+    /// Its path in the system.
+    pub path: String,
+    /// Its unit.
+    pub unit: Unit,
+    /// Its value in SI.
+    pub value: f64,
 }
 
 /// The instance of a [`Request`].
@@ -125,9 +140,10 @@ pub fn flatten(loaded: &Loaded, sources: &dyn Sources, request: &Request) -> Fla
         })
     };
     let (around, overrides): (Vec<Change>, Vec<Change>) = overrides.into_iter().partition(of_frame);
+    let locals: Locals = Rc::new(request.unknowns.iter().map(|unknown| f.declare_unknown(unknown)).collect());
     match &request.instance {
         Instance::Written(instance, file) => {
-            let env = Env::file(*file);
+            let env = Env { locals, ..Env::file(*file) };
             f.written(instance, &env, overrides, false);
         }
         Instance::Variant(instance, file) => {
