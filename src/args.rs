@@ -486,6 +486,8 @@ pub const LEVEL: f64 = 0.95;
 pub const STARTS: usize = 64;
 /// The same, if the model has regimes.
 pub const STARTS_WITH_REGIMES: usize = 256;
+/// Pieces into which the recordings of a fit are divided.
+pub const PIECES: usize = 4;
 
 /// `fric fit`
 #[derive(clap::Args, Debug)]
@@ -513,6 +515,19 @@ pub struct Fit {
     /// Judge the values as they are written, and search for nothing
     #[arg(long)]
     pub check: bool,
+    /// Parameters whose profile is computed: how the misfit grows when the parameter is held and the others are fitted
+    /// again; or all, or none [default: those that end at a bound, or that the data do not determine]
+    #[arg(long, value_name = "PATH,…|all|none", value_delimiter = ',')]
+    pub profile: Vec<String>,
+    /// Pieces of the recordings that are also fitted each, to see whether the values drift; 1 for none
+    #[arg(long, value_name = "K", default_value_t = PIECES, value_parser = pieces)]
+    pub pieces: usize,
+    /// Threads; the answer does not depend on their number [default: one for each processor]
+    #[arg(long, value_name = "N", value_parser = threads)]
+    pub threads: Option<usize>,
+    /// Write NAME.html too: figures of residuals and profiles, with every number
+    #[arg(long)]
+    pub report: bool,
     /// What of the text is changed, and how steps are made
     #[command(flatten)]
     pub stepped: Stepped,
@@ -1258,6 +1273,13 @@ fn tolerance(text: &str) -> Result<f64, String> {
     match text.parse::<f64>() {
         Ok(tol) if tol > 0.0 && tol < 1.0 => Ok(tol),
         _ => Err("a number between 0 and 1 is needed, for example 1e-8".into()),
+    }
+}
+
+fn pieces(text: &str) -> Result<usize, String> {
+    match text.parse() {
+        Ok(pieces) if (1..=100).contains(&pieces) => Ok(pieces),
+        _ => Err("a number from 1 to 100 is needed".into()),
     }
 }
 

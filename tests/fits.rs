@@ -635,3 +635,133 @@ fn initial_values_are_unknowns() {
         assert!(tested.status.success(), "seed {seed}: {tested:?}");
     }
 }
+
+/// Rows of a sliding contact, k 2.5 N·s/m and c 1.2 N, with a change of each: `t,v,F`.
+fn slide(seed: u64, change: &dyn Fn(f64, f64) -> f64) -> String {
+    let mut chance = Chance(seed);
+    let row = |n: u32| {
+        let (t, v) = (0.01 * f64::from(n), f64::sin(0.02 * f64::from(n)));
+        let force = 2.5 * v + 1.2 * v / (v * v + 1e-2).sqrt();
+        format!("{t},{v:e},{:e}\n", force + change(t, v) + 0.01 * chance.normal())
+    };
+    (0..2000).map(row).collect()
+}
+
+const SLIDES: &str = "fit f {\n  run Slide(v = data.v)\n  data \"r.csv\" (t [s], v [m/s], F [N])\n  vary k, c in 0.1 N .. 10 N\n  minimise rms(F - data.F)\n}\n";
+
+/// What stands out in a recording is said, and nothing is said of a recording in which nothing does. With the test of a
+/// warning left out, that warning is missing or the last loop fails.
+#[test]
+fn what_stands_out_in_a_recording_is_said() {
+    type Change = (&'static str, &'static str, &'static dyn Fn(f64, f64) -> f64);
+    const CHANGES: [Change; 5] = [
+        ("W0904", "`c` drifts", &|t, v| 0.01 * t * v / (v * v + 1e-2).sqrt()),
+        ("W0903", "depends on `data.v`", &|_, v| 0.1 * (6.0 * v).sin()),
+        ("W0903", "depends on `t`", &|t, _| 0.02 * (t - 10.0)),
+        ("W0907", "5 rows beyond six standard deviations, between 12 s and 12.04 s", &|t, _| {
+            if (12.0..12.05).contains(&t) { 2.0 } else { 0.0 }
+        }),
+        ("W0908", "fits far worse than the rest", &|t, _| 2.0 * (-20.0 * t).exp()),
+    ];
+    let text = format!("{OFFSET}{SLIDES}");
+    for (k, (code, words, change)) in CHANGES.into_iter().enumerate() {
+        for seed in 0..3 {
+            let (told, exit) = said(&format!("stands-out-{k}"), &text, &slide(seed, change), &[]);
+            assert!(exit == 0 && told.contains(code) && told.contains(words), "seed {seed}: {code} {words}\n{told}");
+        }
+    }
+    let gap: String = slide(1, &|_, _| 0.0)
+        .lines()
+        .enumerate()
+        .filter(|(k, _)| !(700..900).contains(k))
+        .map(|(_, line)| format!("{line}\n"))
+        .collect();
+    let (told, _) = said("gap", &text, &gap, &[]);
+    assert!(told.contains("W0905") && told.contains("has gap"), "{told}");
+    for seed in 0..10 {
+        let (told, exit) = said("nothing", &text, &slide(seed, &|_, _| 0.0), &["--strict"]);
+        assert_eq!((&told[..], exit), ("", 0), "seed {seed}");
+    }
+}
+
+/// A value that drifts has an interval that spans what the pieces say; with the scatter left out it is 20 times
+/// narrower.
+#[test]
+fn a_drifting_value_has_a_wide_interval() {
+    let text = format!("{OFFSET}{SLIDES}");
+    let data = slide(3, &|t, v| 0.01 * t * v / (v * v + 1e-2).sqrt());
+    let answer = fitted("drift", &text, &data);
+    let c = &answer["parameters"][1];
+    assert_eq!((&c["drifts"], c["pieces"].as_array().unwrap().len()), (&Value::from(true), 4), "{answer}");
+    let (low, high) = (c["interval"][0].as_f64().unwrap(), c["interval"][1].as_f64().unwrap());
+    // The mean of c is 1.3 N, and pieces of 5 s are 0.05 N apart: 0.065 N / √4.
+    let sd = c["sd"].as_f64().unwrap();
+    assert!((0.02..0.05).contains(&sd) && low < 1.27 && high > 1.33, "{c}");
+}
+
+/// Two parameters of which only the sum matters: the profile of one ends where the other meets the bound of its range.
+#[test]
+fn profiles_say_how_far_a_parameter_may_go() {
+    let text = format!(
+        "{VISCOUS}  vary k in 0.1 N·s/m .. 10 N·s/m, j in 0.5 N·s/m .. 10 N·s/m, c\n  minimise rms(F - data.F)\n}}\n"
+    );
+    let answer = fitted("profile", &text, &viscous());
+    let k = &answer["parameters"][0];
+    let (low, high) = (&k["profile"]["interval"][0], k["profile"]["interval"][1].as_f64().unwrap());
+    assert_eq!(low, &Value::Null, "{answer}");
+    assert!((high - 2.0).abs() < 0.02, "{k}");
+    assert_eq!(answer["parameters"][2]["profile"], Value::Null, "c is determined: {answer}");
+    let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).join("fits/profile");
+    let output = fric(&folder, &["fit", "f.fric", "--profile", "c"]);
+    let words = String::from_utf8_lossy(&output.stdout);
+    assert!(words.contains("profile of c: 1.") && !words.contains("profile of k"), "{output:?}");
+    let wrong = fric(&folder, &["fit", "f.fric", "--profile", "q"]);
+    assert_eq!(wrong.status.code(), Some(2), "{wrong:?}");
+}
+
+/// The answer has the same bytes for any number of threads.
+#[test]
+fn threads_change_the_time_alone() {
+    let folder = folder("threads");
+    let mut chance = Chance(2);
+    fs::write(folder.join("f.fric"), format!("{OFFSET}fit f {{\n  run Slide(v = data.v)\n  data \"r0.csv\", \"r1.csv\", \"r2.csv\" (t [s], v [m/s], F [N])\n  vary k, c, o each\n  minimise rms(F - data.F)\n}}\n")).unwrap();
+    for (file, content) in slides(&mut chance).0 {
+        fs::write(folder.join(file), content).unwrap();
+    }
+    let of =
+        |threads: &str| fric(&folder, &["fit", "f.fric", "--json", "--profile", "all", "--threads", threads]).stdout;
+    let one = of("1");
+    assert!(!one.is_empty());
+    for threads in ["2", "5"] {
+        assert!(of(threads) == one, "{threads} threads");
+    }
+}
+
+/// The page has every number of the table, and loads nothing.
+#[test]
+fn the_report_is_one_page() {
+    let folder = folder("report");
+    fs::write(folder.join("f.fric"), format!("{OFFSET}{SLIDES}")).unwrap();
+    fs::write(folder.join("r.csv"), slide(4, &|t, v| 0.01 * t * v / (v * v + 1e-2).sqrt())).unwrap();
+    let output = fric(&folder, &["fit", "f.fric", "--report", "--profile", "all"]);
+    assert!(String::from_utf8_lossy(&output.stdout).contains("out/f.html"), "{output:?}");
+    let page = fs::read_to_string(folder.join("out/f.html")).unwrap();
+    for part in [
+        "<h2>Values</h2>",
+        "<td>k</td>",
+        "<td>c</td>",
+        "W0904",
+        "over 4 pieces",
+        "Profiles",
+        "autocorrelation",
+        "fit f {",
+    ] {
+        assert!(page.contains(part), "{part}");
+    }
+    let bare = page.replace("http://www.w3.org/2000/svg", "").replace("url(#", "");
+    for load in ["http", "<script", "src=", "@import", "url("] {
+        assert!(!bare.contains(load), "{load}");
+    }
+    assert_eq!(page.matches("<svg").count(), page.matches("</svg>").count());
+    assert!(page.matches("<svg").count() >= 7, "{}", page.matches("<svg").count());
+}

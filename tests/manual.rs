@@ -135,7 +135,13 @@ const ELSEWHERE: &[(&str, &str)] = &[
     ("E0907", "a search finds it: tests/fits.rs"),
     ("W0910", "a search finds it: tests/fits.rs"),
     ("W0902", "a search finds it: tests/fits.rs"),
+    ("W0903", "a search finds it: tests/fits.rs"),
+    ("W0904", "a search finds it: tests/fits.rs"),
+    ("W0905", "a search finds it: tests/fits.rs"),
     ("W0906", "a search finds it: tests/fits.rs"),
+    ("W0907", "a search finds it: tests/fits.rs"),
+    ("W0908", "a search finds it: tests/fits.rs"),
+    ("W0909", "a search finds it: tests/fits.rs"),
     ("W0911", "a search finds it: tests/fits.rs"),
 ];
 

@@ -165,7 +165,7 @@ pub fn comparison(studies: &[Study]) -> String {
     page("Friction models side by side", &body)
 }
 
-fn page(title: &str, body: &str) -> String {
+pub fn page(title: &str, body: &str) -> String {
     format!(
         "<!DOCTYPE html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n\
          <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\n\
@@ -350,7 +350,7 @@ fn prose(doc: &str) -> String {
 }
 
 /// A line of text, with backticks as code.
-fn words(text: &str) -> String {
+pub fn words(text: &str) -> String {
     let parts = text.split('`').enumerate();
     let part = |(i, part): (usize, &str)| match i % 2 {
         1 => format!("<code>{}</code>", escaped(part)),
@@ -383,6 +383,6 @@ fn capital(clause: &str) -> String {
     letters.next().map_or(String::new(), |first| first.to_uppercase().chain(letters).collect())
 }
 
-fn escaped(text: &str) -> String {
+pub fn escaped(text: &str) -> String {
     text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
 }

@@ -3,16 +3,18 @@
 //! The result of the search is shown as a table, as an
 //! instance to paste, and written as JSON, CSV and a picture.
 
+mod search;
+mod after;
 mod answer;
 mod laws;
-mod search;
+mod page;
 mod text;
 mod of_laws;
 
 use super::{End, load, reported, sound, sweep};
 use crate::args;
 use crate::commands::fit::answer::Fitted;
-use crate::commands::fit::search::{Found, Part, Runs, Settings, search};
+use crate::commands::fit::search::{Found, Part, Runs, Settings, search, search_from};
 use crate::compile::{self, Asks, Changes, Loaded, Options, Stopwatch};
 use crate::figure::{self, Recorded};
 use crate::plot::{self, Kind, Look};
@@ -112,9 +114,13 @@ fn one(args: &args::Fit, loaded: &mut Loaded, name: &str, options: &Options, ter
         return End::Misused;
     }
     let begin = Instant::now();
-    let runs = Runs::new(compiled);
+    let runs = Runs::new(compiled, args.threads);
     if args.check {
         return check(args, &runs, loaded, name, terminal);
+    }
+    if let Some(unknown) = unknown_profile(args, &runs) {
+        terminal.error(&format!("--profile: fit `{name}` does not vary `{unknown}`"));
+        return End::Misused;
     }
     let found = match search(&runs, Settings::of(args)) {
         Ok(found) => found,
@@ -142,9 +148,15 @@ struct Asked<'a> {
 }
 
 /// Shows the answer of a fit and writes its files.
-fn conclude(question: &Asked, runs: &Runs, (answer, steps, note): Found, seconds: f64, terminal: &mut Terminal) -> End {
+fn conclude(question: &Asked, runs: &Runs, found: Found, seconds: f64, terminal: &mut Terminal) -> End {
     let Asked { args, file, data, loaded, name, rank } = *question;
-    let mut fitted = Fitted::new(name, runs, answer, &steps, args.level, seconds);
+    let begin = Instant::now();
+    let settings = Settings::of(args);
+    let (found, profiles) = profiled(args, runs, found, settings);
+    let pieces = after::pieces(runs, &found, settings, args.pieces);
+    let (answer, steps, note) = found;
+    let mut fitted = Fitted::new(name, runs, answer, &steps, args.level, seconds + begin.elapsed().as_secs_f64());
+    (fitted.profiles, fitted.pieces) = (profiles, pieces);
     fitted.notes.extend(note);
     fitted.rank = rank;
     let mut outcomes = Vec::new();
@@ -168,6 +180,7 @@ fn conclude(question: &Asked, runs: &Runs, (answer, steps, note): Found, seconds
             unsettled: if part.asks.steady { part.unsettled(values, &fitted.answer.rms[items]) } else { 0 },
             solver,
             step: *step,
+            remarks: after::remarks(part, &fitted.answer, runs.items()[fitted.runs.len()].clone()),
         });
     }
     let warnings = fitted.warnings(runs);
@@ -184,7 +197,7 @@ fn conclude(question: &Asked, runs: &Runs, (answer, steps, note): Found, seconds
         let place = text::Place { folder: &args.out, file, recordings: &recordings };
         // A text on the standard input has no place from which another could import it.
         let text = (!project::is_standard(file)).then(|| text::text(loaded, statement, &fitted, runs, &place));
-        match written(question, text, runs, &fitted, &outcomes, &recordings) {
+        match written(question, text, runs, &fitted, (&outcomes, &warnings), &recordings) {
             Ok(paths) if !args.quiet => {
                 let paths: Vec<String> = paths.iter().map(|path| path.display().to_string()).collect();
                 terminal.line(&format!("  wrote {}", paths.join(", ")));
@@ -206,6 +219,55 @@ fn conclude(question: &Asked, runs: &Runs, (answer, steps, note): Found, seconds
     }
     let bad = !failed.is_empty() || !fitted.converged() || args.strict && !warnings.is_empty();
     if bad { End::Failed } else { End::Fine }
+}
+
+/// A path of `--profile` that the fit does not vary.
+fn unknown_profile<'a>(args: &'a args::Fit, runs: &Runs) -> Option<&'a str> {
+    let is_known = |path: &str| runs.unknowns.iter().any(|unknown| unknown.path == path || unknown.label == path);
+    args.profile.iter().map(String::as_str).find(|path| !matches!(*path, "all" | "none") && !is_known(path))
+}
+
+/// The profiles that are asked for, or that the answer needs. Where a profile meets a better answer, the search goes on
+/// from there, once.
+fn profiled(
+    args: &args::Fit,
+    runs: &Runs,
+    mut found: Found,
+    settings: Settings,
+) -> (Found, Vec<Option<after::Profile>>) {
+    let n = runs.unknowns.len();
+    let mut again = true;
+    'answer: loop {
+        let answer = &found.0;
+        let is_asked = |k: usize| {
+            let unknown = &runs.unknowns[k];
+            match &args.profile[..] {
+                [] => answer.at_bound[k].is_some() || answer::is_open(answer, k),
+                [one] if one == "none" => false,
+                named => named.iter().any(|one| *one == "all" || *one == unknown.path || *one == unknown.label),
+            }
+        };
+        let mut profiles = Vec::new();
+        for k in 0..n {
+            profiles.push(match is_asked(k).then(|| after::profile(runs, &found, settings, k)) {
+                None => None,
+                Some(Ok(profile)) => Some(profile),
+                Some(Err(better)) => {
+                    if again && let Ok(next) = search_from(runs, &better, settings) {
+                        again = false;
+                        let (mut answer, steps, note) = next;
+                        answer.runs += found.0.runs;
+                        (answer.starts, answer.followed, answer.ends) =
+                            (found.0.starts, found.0.followed, found.0.ends.clone());
+                        found = (answer, steps, note);
+                        continue 'answer;
+                    }
+                    None
+                }
+            });
+        }
+        return (found, profiles);
+    }
 }
 
 /// The run with these values, and a range that it left.
@@ -245,7 +307,7 @@ pub fn verdicts(loaded: &mut Loaded, name: &str, interpret: bool, terminal: &Ter
             return None;
         }
     };
-    let runs = Runs::new(compiled);
+    let runs = Runs::new(compiled, None);
     let settings = Settings { level: args::LEVEL, starts: None, seed: 0 };
     let (answer, steps, _) = match search(&runs, settings) {
         Ok(found) => found,
@@ -327,12 +389,13 @@ fn written(
     text: Option<String>,
     runs: &Runs,
     fitted: &Fitted,
-    outcomes: &[engine::Outcome],
+    (outcomes, warnings): (&[engine::Outcome], &[Diagnostic]),
     recordings: &[(PathBuf, String)],
 ) -> Result<Vec<PathBuf>, (PathBuf, std::io::Error)> {
     let mut files: Vec<(PathBuf, Vec<u8>)> = Vec::new();
     let (args, name) = (question.args, question.name);
     let at = |stem: &str, ending: &str| args.out.join(format!("{stem}.{ending}"));
+    let mut shown = Vec::new();
     if let Some(text) = text {
         files.push((at(name, "fric"), text.into_bytes()));
     }
@@ -345,6 +408,7 @@ fn written(
         let point = std::slice::from_ref(&fitted.answer.values);
         if let Ok(values) = part.sampled(point, run.step, &part.instants, &slots).remove(0) {
             files.push((at(&stem, "csv"), answer::table(asks, &part.instants, &values).into_bytes()));
+            shown.push(page::Shown { recording: &outcome.recording, rows: values });
         }
         let plots = &part.varying.plots;
         if !plots.is_empty() {
@@ -356,6 +420,11 @@ fn written(
             let drawn = figure::figure(&stem, &subtitle, 0, &[drawn]);
             files.push((at(&stem, "svg"), plot::picture(&drawn, &Look::default(), Kind::Svg)));
         }
+    }
+    if args.report && shown.len() == runs.parts.len() {
+        let statement = compile::find_fit(question.loaded, name).expect("it has been fitted");
+        let text = question.loaded.files.slice(statement.span);
+        files.push((at(name, "html"), page::report(fitted, runs, (name, text), warnings, &shown).into_bytes()));
     }
     let mut paths = Vec::new();
     for (path, bytes) in files {

@@ -59,6 +59,8 @@ pub struct Asks {
     pub items: Vec<Item>,
     /// Times of the rows of the recording in s, from 0.
     pub rows: Vec<f64>,
+    /// The columns of the recording beside time: name, unit, and a value in SI for each row.
+    pub columns: Vec<(String, Unit, Vec<f64>)>,
     /// The rows are steady points, without time: each is held for [`of_fit::HELD`], and compared at the end.
     pub steady: bool,
     /// Times at which the recorded inputs have corners, in s.
@@ -518,6 +520,7 @@ fn asks(
         place: of_fit::Part::default(),
         slots: Vec::new(),
         items,
+        columns: columns(variant),
         corners: of_fit::corners(&rows, variant.steady),
         rows,
         steady: variant.steady,
@@ -559,6 +562,18 @@ fn items(loaded: &Loaded, parts: &Parts, plot: &Plot, diagnostics: &mut Vec<Diag
         all.push(Item { text: one_line(loaded, of.span), slot, unit, sd, sides });
     }
     all
+}
+
+/// The columns of the recording beside time, with a value for each row.
+fn columns(variant: &Variant) -> Vec<(String, Unit, Vec<f64>)> {
+    // A steady point is held from one time to another.
+    let every = if variant.steady { 2 } else { 1 };
+    let tables = variant.system.tables.iter().filter(|table| table.y.len() == every * variant.rows.len());
+    let column = |table: &crate::frontend::system::Table| {
+        let name = table.name.strip_prefix("data.").filter(|name| *name != "t")?;
+        Some((format!("data.{name}"), table.y_unit.clone(), table.y.iter().step_by(every).copied().collect()))
+    };
+    tables.filter_map(column).collect()
 }
 
 /// `1 row`, `2 rows`

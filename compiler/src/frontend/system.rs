@@ -487,6 +487,12 @@ pub const LINTS: &[(&str, &str)] = &[
     ("unidentified", "W0910"),
     ("at-bound", "W0902"),
     ("rough", "W0906"),
+    ("model-error", "W0903"),
+    ("drift", "W0904"),
+    ("gap", "W0905"),
+    ("outliers", "W0907"),
+    ("start", "W0908"),
+    ("lone", "W0909"),
     ("unsettled", "W0911"),
 ];
 

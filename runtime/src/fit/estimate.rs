@@ -130,6 +130,8 @@ pub struct Answer {
     pub followed: usize,
     /// Searches that ended where the best did.
     pub agreed: usize,
+    /// Where each search ended: −2 log-likelihood with white noise, but for a constant.
+    pub ends: Vec<f64>,
     /// Number of runs, and how many of them failed for each cause.
     pub runs: u64,
     /// Causes of failed runs, with their numbers.
@@ -218,7 +220,7 @@ pub fn fit(question: Question) -> Result<Answer, Trouble> {
             break;
         }
     }
-    let followed = (ends.len(), agreed(&ends));
+    let followed = (ends.iter().map(|end| end.misfit).collect(), agreed(&ends));
     // Of equal ends the first one: in a flat valley, that of the written start.
     let least = ends.iter().map(|end| end.misfit).fold(f64::INFINITY, f64::min);
     let best = ends.into_iter().find(|end| end.misfit - least <= EQUAL_END);
@@ -547,7 +549,7 @@ impl Search<'_> {
         items: &[Item],
         x: &[f64],
         level: f64,
-        (why, starts, (followed, agreed)): (Ended, usize, (usize, usize)),
+        (why, starts, (ends, agreed)): (Ended, usize, (Vec<f64>, usize)),
     ) -> Result<Answer, Trouble> {
         let n = x.len();
         let residuals = self.residuals(x).map_err(Trouble::NoStart)?;
@@ -621,8 +623,9 @@ impl Search<'_> {
             residuals,
             why,
             starts,
-            followed,
+            followed: ends.len(),
             agreed,
+            ends,
             noise: self.noise,
             runs: self.runs,
             failures: self.failures,

@@ -10,8 +10,10 @@ pub mod least_squares;
 pub mod trust_region;
 pub mod noise;
 pub mod estimate;
+pub mod statistics;
 pub mod ranking;
 
-pub use estimate::{Answer, Item, Minima, Question, Trouble, Way, fit};
+pub use estimate::{Answer, Combination, Item, Minima, Question, Residuals, Trouble, Way, fit};
+pub use noise::Noise;
 pub use trust_region::Ended;
 pub use unknowns::{Elementary, Unknown};

@@ -1,14 +1,17 @@
 //! The answer of a fit in words, as JSON and as a table.
 
+use super::after::{Piece, Profile, Remarks, scatter};
+use super::page;
 use super::search::{Part, Runs};
-use crate::compile::{Asks, FitItem, FitUnknown, HELD};
+use crate::compile::{Asks, ElementaryFunction, FitItem, FitUnknown, HELD};
 use crate::quantity::{count, duration, show, significant};
 use crate::results::{self, number};
 use crate::terminal::Terminal;
 use abi::plan::Solver;
 use abi::unit::Unit;
 use grammar::diagnostic::Diagnostic;
-use runtime::fit::{Answer, Ended};
+use runtime::fit::statistics::gaps;
+use runtime::fit::{Answer, Combination, Ended};
 use runtime::run::verdict::Verdict;
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
@@ -29,6 +32,10 @@ pub struct Fitted {
     pub answer: Answer,
     /// Its runs, in the order of the recordings.
     pub runs: Vec<Run>,
+    /// Values in pieces of the recordings.
+    pub pieces: Vec<Piece>,
+    /// The profile of each unknown, where it was computed.
+    pub profiles: Vec<Option<Profile>>,
     /// Each model with the values found, to paste.
     pub instances: Vec<String>,
     /// The values found, each as `--set` takes it.
@@ -54,6 +61,8 @@ pub struct Run {
     pub unsettled: usize,
     /// The compared measures of a run by that solver, in SI.
     pub measures: Vec<f64>,
+    /// What stands out in the residuals of each compared quantity.
+    pub remarks: Vec<Remarks>,
     /// What the fitted run is expected to fulfil.
     pub verdicts: Vec<Verdict>,
 }
@@ -90,6 +99,8 @@ impl Fitted {
             set: all.iter().map(|k| format!("{}={}", runs.unknowns[*k].path, shown(*k))).collect(),
             answer,
             runs: Vec::new(),
+            pieces: Vec::new(),
+            profiles: Vec::new(),
             level,
             seconds,
             rank: None,
@@ -136,10 +147,15 @@ impl Fitted {
                 [head @ .., last] => format!("these data do not tell {} from {last}", head.join(", ")),
                 [] => continue,
             };
+            let moved: Vec<String> = parts.iter().filter_map(|k| change(open, *k, &runs.unknowns[*k])).collect();
+            let message = match moved.is_empty() {
+                true => message,
+                false => format!("{message}: {} moves what is compared by less than its noise", moved.join(" with ")),
+            };
             let mut warning = Diagnostic::warning("W0910", message);
             for k in parts {
                 let unknown = &runs.unknowns[k];
-                let sd = match is_open(unknown, answer.sd[k]) {
+                let sd = match is_unknown(unknown, answer.sd[k]) {
                     true => "not determined".to_string(),
                     false => format!("± {}", show(answer.sd[k], &unknown.unit, 2)),
                 };
@@ -174,6 +190,71 @@ impl Fitted {
             all.push(("rough", warning.help(
                 "its standard deviation may be wrong: take a tighter tolerance or a shorter step, or locate events with `solver adaptive`",
             )));
+        }
+        for (k, unknown) in runs.unknowns.iter().enumerate() {
+            let Some(found) = scatter(&self.pieces, k).filter(|found| found.drifts) else { continue };
+            let message =
+                format!("`{}` drifts: the pieces of the recordings differ by more than chance", unknown.label);
+            let label = format!("{} in {} pieces", ends_of(found.ends, unknown), found.pieces);
+            let warning = Diagnostic::warning("W0904", message).label(unknown.span, label);
+            all.push(("drift", warning.help(
+                "its interval is widened by the scatter; fit a shorter recording, or let what drifts differ: `vary … each` over several recordings",
+            )));
+        }
+        for (part, run) in runs.parts.iter().zip(&self.runs) {
+            let of = if runs.parts.len() > 1 { format!(" of {}", part.asks.label) } else { String::new() };
+            let gaps = if part.asks.steady { 0 } else { gaps(&part.asks.rows).len() };
+            if gaps > 0 {
+                let what = if gaps == 1 { "gap".to_string() } else { format!("{} gaps", count(gaps as u64)) };
+                let warning = Diagnostic::warning("W0905", format!("the recording{of} has {what}"))
+                    .label(runs.name, "an interval between rows is longer than usual");
+                all.push((
+                    "gap",
+                    warning.help(
+                        "inputs go straight across it; fit the parts before and after it as recordings of their own",
+                    ),
+                ));
+            }
+            for (item, remarks) in part.asks.items.iter().zip(&run.remarks) {
+                if let Some((name, unit, found)) = &remarks.depends {
+                    let message = format!("what the model leaves of `{}`{of} depends on `{name}`", item.text);
+                    let share = significant(100.0 * found.share, 2);
+                    let label = format!("{share} % of its variance, most {}", page::class(found, unit));
+                    let warning = Diagnostic::warning("W0903", message).label(runs.name, label);
+                    all.push(("model-error", warning.help(
+                        "the law lacks something that the recording shows; compare others, or look at the residuals with `--report`",
+                    )));
+                }
+                if remarks.outliers.is_some() {
+                    let message = format!("few rows hold most of the error of `{}`{of}", item.text);
+                    let alone = Remarks { outliers: remarks.outliers.clone(), ..Remarks::default() };
+                    let warning = Diagnostic::warning("W0907", message).label(runs.name, page::said(&alone, part));
+                    all.push((
+                        "outliers",
+                        warning.help("look at them; leave them out with `after` and `before`, or remove the rows"),
+                    ));
+                }
+                if remarks.begins_badly {
+                    let message = format!("the beginning of `{}`{of} fits far worse than the rest", item.text);
+                    let warning =
+                        Diagnostic::warning("W0908", message).label(runs.name, "a state may have begun elsewhere");
+                    all.push((
+                        "start",
+                        warning.help(
+                            "vary an initial value, as in `vary initial(z) in -10 um .. 10 um`, or compare `after` it",
+                        ),
+                    ));
+                }
+            }
+        }
+        if answer.followed > 2 && answer.agreed < 2 {
+            let message = "only one search ended here, others in poorer minima";
+            let label = format!("{} searches followed", answer.followed);
+            let warning = Diagnostic::warning("W0909", message).label(runs.name, label);
+            all.push((
+                "lone",
+                warning.help("a better minimum may exist: try `--starts 500`, another `--seed`, or a start nearby"),
+            ));
         }
         for (part, run) in runs.parts.iter().zip(&self.runs).filter(|(_, run)| run.unsettled > 0) {
             let [points, all_points] = [run.unsettled, part.asks.rows.len()].map(|n| count(n as u64));
@@ -247,6 +328,18 @@ impl Fitted {
         if !pairs.is_empty() {
             out += &format!("  correlation above {CORRELATED}: {}\n", pairs.join("; "));
         }
+        for (k, unknown) in runs.unknowns.iter().enumerate() {
+            if let Some(words) = self.profile_words(k, unknown) {
+                out += &format!("  profile of {}: {words}\n", unknown.label);
+            }
+        }
+        for (k, unknown) in runs.unknowns.iter().enumerate() {
+            if scatter(&self.pieces, k).is_some_and(|found| found.drifts)
+                && let Some(words) = self.piece_words(k, unknown)
+            {
+                out += &format!("  {} drifts: {words}\n", unknown.label);
+            }
+        }
         for ((part, run), items) in runs.parts.iter().zip(&self.runs).zip(runs.items()) {
             let indent = if several { "    " } else { "  " };
             if several {
@@ -285,12 +378,42 @@ impl Fitted {
         out
     }
 
+    /// The standard deviation and the interval of an unknown, widened where it drifts.
+    fn spread(&self, k: usize, unknown: &FitUnknown) -> (f64, (f64, f64)) {
+        let (sd, (low, high)) = (self.answer.sd[k], self.answer.intervals[k]);
+        let Some(found) = scatter(&self.pieces, k).filter(|found| found.drifts) else { return (sd, (low, high)) };
+        let wide = (found.sd / (found.pieces as f64).sqrt()).max(sd);
+        let value = self.answer.values[k];
+        let (from, to) = (value - (value - low) * wide / sd, value + (high - value) * wide / sd);
+        // A positive parameter keeps a positive bound.
+        let from = if unknown.range.0 >= 0.0 { from.max(low * sd / wide) } else { from };
+        (wide, (from, to))
+    }
+
+    /// The values of an unknown in the pieces, in words.
+    pub fn piece_words(&self, k: usize, unknown: &FitUnknown) -> Option<String> {
+        let found = scatter(&self.pieces, k)?;
+        Some(format!("{} over {} pieces", ends_of(found.ends, unknown), found.pieces))
+    }
+
+    /// The profile of an unknown, in words.
+    pub fn profile_words(&self, k: usize, unknown: &FitUnknown) -> Option<String> {
+        let profile = self.profiles.get(k)?.as_ref()?;
+        let value = |si: f64| show(si, &unknown.unit, 3);
+        Some(match profile.ends {
+            (Some(_), Some(_)) => ends_of((profile.ends.0?, profile.ends.1?), unknown),
+            (None, Some(high)) => format!("below {}, not bounded from below", value(high)),
+            (Some(low), None) => format!("above {}, not bounded from above", value(low)),
+            (None, None) => "anywhere in its range".into(),
+        })
+    }
+
     /// A value with its unit, then its deviation and the ends of its interval without; these are empty where the data
     /// say nothing.
     pub fn shown(&self, k: usize, unknown: &FitUnknown) -> [String; 4] {
-        let (sd, (low, high)) = (self.answer.sd[k], self.answer.intervals[k]);
+        let (sd, (low, high)) = self.spread(k, unknown);
         let value = rounded(self.answer.values[k], sd, &unknown.unit);
-        if is_open(unknown, sd) {
+        if is_unknown(unknown, sd) {
             return [value, String::new(), String::new(), String::new()];
         }
         let end = |value: f64| rounded(value, sd, &plain(&unknown.unit));
@@ -307,19 +430,28 @@ impl Fitted {
             .iter()
             .enumerate()
             .map(|(k, one)| {
-                let (low, high) = answer.intervals[k];
+                let (sd, (low, high)) = self.spread(k, one);
                 let of = |si: f64| number(one.unit.from_si(si));
                 json!({
                     "path": one.path,
                     "initial": one.initial,
                     "recording": one.of.map(|of| runs.parts[of].asks.label.clone()),
                     "value": of(answer.values[k]),
-                    "sd": width(&one.unit, answer.sd[k]),
+                    "sd": width(&one.unit, sd),
                     "interval": [of(low), of(high)],
                     "start": of(one.start),
                     "range": [of(one.range.0), of(one.range.1)],
                     "at_bound": answer.at_bound[k].map(|upper| if upper { "upper" } else { "lower" }),
                     "rough": answer.rough.contains(&k),
+                    "pieces": self.pieces.iter().map(|piece| piece[k].map(|(value, sd)| json!({
+                        "value": of(value),
+                        "sd": width(&one.unit, sd),
+                    }))).collect::<Vec<_>>(),
+                    "drifts": scatter(&self.pieces, k).is_some_and(|found| found.drifts),
+                    "profile": self.profiles.get(k).and_then(Option::as_ref).map(|profile| json!({
+                        "points": profile.points.iter().map(|(x, rise)| json!([of(*x), number(*rise)])).collect::<Vec<_>>(),
+                        "interval": [profile.ends.0.map(of), profile.ends.1.map(of)],
+                    })),
                     "unit": one.unit.text,
                 })
             })
@@ -387,15 +519,47 @@ impl Fitted {
     }
 }
 
+/// The ends of an interval of an unknown, with one unit.
+fn ends_of((low, high): (f64, f64), unknown: &FitUnknown) -> String {
+    format!("{} .. {}", show(low, &plain(&unknown.unit), 4), show(high, &unknown.unit, 4))
+}
+
+/// Whether an unknown is part of a combination that the data do not determine.
+pub fn is_open(answer: &Answer, k: usize) -> bool {
+    answer.undetermined.iter().any(|open| {
+        let largest = open.direction.iter().map(|c| c.abs()).fold(0.0, f64::max);
+        open.direction[k].abs() >= NAMED * largest
+    })
+}
+
+/// How an unknown changes along a combination that moves the outputs by one standard deviation of their noise, at most
+/// over a tenth of its range: `vs × 2`, `Fs − 1 %`. None if it hardly changes.
+fn change(open: &Combination, k: usize, unknown: &FitUnknown) -> Option<String> {
+    let (low, high) = unknown.range;
+    let logarithmic = low * high > 0.0 && (high / low).abs().max((low / high).abs()) >= 10.0;
+    let step = open.direction[k] * (1.0 / open.sensitivity).min(1.0);
+    let name = &unknown.label;
+    let (sign, size) = (if step < 0.0 { "−" } else { "+" }, step.abs());
+    if size < 1e-4 {
+        return None;
+    }
+    Some(match logarithmic {
+        true if size < 0.3 => format!("{name} {sign} {} %", significant(100.0 * size, 2)),
+        true if step > 0.0 => format!("{name} × {}", significant(ElementaryFunction::exp().at(size), 2)),
+        true => format!("{name} / {}", significant(ElementaryFunction::exp().at(size), 2)),
+        false => format!("{name} {sign} {}", show(size * (high - low), &unknown.unit, 2)),
+    })
+}
+
 /// The models that are run, each once.
-fn models(runs: &Runs) -> String {
+pub fn models(runs: &Runs) -> String {
     let mut models: Vec<&str> = runs.parts.iter().map(|part| &part.asks.model[..]).collect();
     models.dedup();
     models.join(", ")
 }
 
 /// Whether a standard deviation is as wide as the range: then the data say nothing.
-fn is_open(unknown: &FitUnknown, sd: f64) -> bool {
+fn is_unknown(unknown: &FitUnknown, sd: f64) -> bool {
     sd.is_nan() || sd >= unknown.range.1 - unknown.range.0
 }
 

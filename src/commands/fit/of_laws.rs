@@ -58,7 +58,7 @@ pub fn of_laws(args: &args::Fit, terminal: &mut Terminal) -> End {
             }
         };
         let begin = Instant::now();
-        let runs = Runs::new(compiled);
+        let runs = Runs::new(compiled, args.threads);
         let found = search(&runs, Settings::of(args));
         let held_out = found.as_ref().ok().and_then(|found| held_out(&runs, found, Settings::of(args)));
         let contender = Contender { parameters: runs.unknowns.len(), held_out };

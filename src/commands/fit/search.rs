@@ -36,6 +36,8 @@ pub struct Runs {
 
 /// The runs against one recording.
 pub struct Part {
+    /// Threads that share the runs.
+    threads: usize,
     /// Runs under other values.
     pub varying: Varying,
     /// What is asked.
@@ -60,7 +62,7 @@ struct Held {
 pub type Residuals = Result<Vec<Vec<f64>>, String>;
 
 impl Part {
-    fn new(part: compile::FitPart) -> Part {
+    fn new(part: compile::FitPart, threads: usize) -> Part {
         let compile::FitPart { mut varying, held, asks } = part;
         // The last plot holds the compared quantities, each followed by its two sides.
         varying.plots.pop();
@@ -79,7 +81,7 @@ impl Part {
         let (after, before) = asks.window;
         let instants = asks.rows.iter().copied().filter(|t| (after..=before).contains(t)).collect();
         let slots = asks.items.iter().map(|item| item.slot).collect();
-        Part { varying, asks, instants, slots, held }
+        Part { threads, varying, asks, instants, slots, held }
     }
 
     /// The step as the text has it, in s; 0 for an adaptive run.
@@ -176,20 +178,22 @@ impl Part {
                 Err(why) => out[place] = Some(Err(why)),
             }
         }
-        let watch = &mut |_| Continue::Continue(());
         let varying = match (way, &self.held) {
             (Way::Held(_), Some(held)) => &held.varying,
             _ => &self.varying,
         };
-        let results = match varying.lanes().filter(|lanes| all.len() >= lanes.width() / 2) {
-            Some(code) => lanes::sample(code, all, instants, slots, watch),
-            None => {
-                let mut one = |(instance, experiment): (Instance, Experiment)| {
-                    engine::sample(instance, &experiment, instants, slots, watch)
-                };
-                all.into_iter().map(&mut one).collect()
+        let results = shared(all, self.threads, varying.lanes().map_or(1, |lanes| lanes.width()), &|all| {
+            let watch = &mut |_| Continue::Continue(());
+            match varying.lanes().filter(|lanes| all.len() >= lanes.width() / 2) {
+                Some(code) => lanes::sample(code, all, instants, slots, watch),
+                None => {
+                    let mut one = |(instance, experiment): (Instance, Experiment)| {
+                        engine::sample(instance, &experiment, instants, slots, watch)
+                    };
+                    all.into_iter().map(&mut one).collect()
+                }
             }
-        };
+        });
         for (place, (values, ended)) in places.into_iter().zip(results) {
             out[place] = Some(match ended {
                 Err(failure) => Err(cause(&failure)),
@@ -256,9 +260,10 @@ impl Part {
 
 impl Runs {
     /// The runs of a fit.
-    pub fn new(fit: compile::Fit) -> Runs {
+    pub fn new(fit: compile::Fit, threads: Option<usize>) -> Runs {
         let compile::Fit { parts, unknowns, name, allowed } = fit;
-        Runs { parts: parts.into_iter().map(Part::new).collect(), unknowns, name, allowed }
+        let threads = threads.unwrap_or_else(|| std::thread::available_parallelism().map_or(1, usize::from));
+        Runs { parts: parts.into_iter().map(|part| Part::new(part, threads)).collect(), unknowns, name, allowed }
     }
 
     /// The steps as the text has them.
@@ -282,7 +287,7 @@ impl Runs {
     }
 
     /// The search's view of what is asked, from these starts.
-    fn asked(&self, starts: &[f64]) -> (Vec<Unknown>, Vec<Item>) {
+    pub(super) fn asked(&self, starts: &[f64]) -> (Vec<Unknown>, Vec<Item>) {
         let unknown = |(one, start): (&compile::FitUnknown, &f64)| Unknown {
             low: one.range.0,
             high: one.range.1,
@@ -319,6 +324,41 @@ impl Runs {
         };
         joined(points.len(), self.parts.iter().zip(steps).map(of))
     }
+
+    /// The same at some of the compared rows of each recording.
+    pub fn residuals_of(
+        &self,
+        points: &[Vec<f64>],
+        steps: &[f64],
+        rows: &dyn Fn(&Part) -> Range<usize>,
+    ) -> Vec<Residuals> {
+        let of = |(part, step): (&Part, &f64)| part.residuals_at(Way::Whole, points, *step, &part.instants[rows(part)]);
+        joined(points.len(), self.parts.iter().zip(steps).map(of))
+    }
+}
+
+/// Calls a function with shares of a list, each in a thread and a multiple of `width` long, and joins its results. Each
+/// run has the same bits wherever it is run.
+fn shared<A: Send, B: Send>(
+    mut all: Vec<A>,
+    threads: usize,
+    width: usize,
+    of: &(dyn Fn(Vec<A>) -> Vec<B> + Sync),
+) -> Vec<B> {
+    let share = all.len().div_ceil(threads.max(1)).next_multiple_of(width.max(1));
+    if all.len() <= share {
+        return of(all);
+    }
+    let mut shares = Vec::new();
+    while all.len() > share {
+        let rest = all.split_off(share);
+        shares.push(std::mem::replace(&mut all, rest));
+    }
+    shares.push(all);
+    std::thread::scope(|scope| {
+        let running: Vec<_> = shares.into_iter().map(|share| scope.spawn(move || of(share))).collect();
+        running.into_iter().flat_map(|one| one.join().expect("a run does not panic")).collect()
+    })
 }
 
 /// The residuals of several recordings together.
@@ -370,7 +410,7 @@ impl Settings {
 pub type Found = (Answer, Vec<f64>, Option<String>);
 
 /// Estimates the unknowns from some rows.
-fn estimate(
+pub(super) fn estimate(
     runs: &Runs,
     unknowns: &[Unknown],
     items: &[Item],
@@ -394,7 +434,16 @@ fn estimate(
 /// Searches with the steps of the text, and again with half of those of which half moves a residual noticeably.
 pub fn search(runs: &Runs, settings: Settings) -> Result<Found, Trouble> {
     let written: Vec<f64> = runs.unknowns.iter().map(|one| one.start).collect();
-    let (mut unknowns, items) = runs.asked(&written);
+    searched(runs, &written, settings)
+}
+
+/// Searches from these values alone.
+pub fn search_from(runs: &Runs, values: &[f64], settings: Settings) -> Result<Found, Trouble> {
+    searched(runs, values, Settings { starts: Some(1), ..settings })
+}
+
+fn searched(runs: &Runs, written: &[f64], settings: Settings) -> Result<Found, Trouble> {
+    let (mut unknowns, items) = runs.asked(written);
     let mut steps = runs.steps();
     let mut spent = 0;
     let mut judged = None;
@@ -403,8 +452,8 @@ pub fn search(runs: &Runs, settings: Settings) -> Result<Found, Trouble> {
         let starts = if judged.is_none() { settings.starts } else { Some(1) };
         let mut answer = estimate(runs, &unknowns, &items, Settings { starts, ..settings }, &mut run)?;
         // Later searches continue from where the first one ended.
-        let (starts, followed, agreed) = *judged.get_or_insert((answer.starts, answer.followed, answer.agreed));
-        (answer.starts, answer.followed, answer.agreed) = (starts, followed, agreed);
+        let first = judged.get_or_insert((answer.starts, answer.followed, answer.agreed, answer.ends.clone()));
+        (answer.starts, answer.followed, answer.agreed, answer.ends) = first.clone();
         answer.runs += spent;
         let mut too_long: Vec<(usize, Result<f64, String>)> = Vec::new();
         for (k, (part, items)) in runs.parts.iter().zip(runs.items()).enumerate() {

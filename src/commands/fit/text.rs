@@ -19,7 +19,8 @@ const WIDTH: usize = 120;
 /// The experiment allows this multiple of each measure that was found.
 const ALLOWED: f64 = 1.05;
 /// Lints of fits, which an experiment does not have.
-const OF_FITS: [&str; 4] = ["unidentified", "at-bound", "rough", "unsettled"];
+const OF_FITS: [&str; 10] =
+    ["unidentified", "at-bound", "rough", "unsettled", "model-error", "drift", "gap", "outliers", "start", "lone"];
 
 /// Where a fit comes from, and where its text goes to.
 pub struct Place<'a> {

@@ -1,0 +1,313 @@
+//! What is asked of a fit that has an answer: whether its values hold in every piece of the recordings, how far a
+//! parameter may go, and what the residuals depend on.
+//!
+//! In: runs and their answer. Out: values of pieces, profiles, and what stands out in the residuals. Knows nothing of
+//! words.
+
+use super::answer::is_open;
+use super::search::{Found, Part, Runs, Settings, estimate};
+use crate::compile::ElementaryFunction;
+use runtime::fit::statistics::{self, Dependence, Outliers};
+use runtime::fit::{Answer, Elementary, Item, Noise, Residuals, Trouble, Unknown, Way};
+
+/// χ² of one degree of freedom that 5 % exceed: a profile ends where the misfit has grown by it.
+const RISE: f64 = 3.84;
+/// Most points of a profile on each side.
+const MOST_POINTS: usize = 14;
+/// Most points between the last one below that growth and the first above it.
+const MOST_REFINEMENTS: usize = 8;
+/// A misfit that is smaller by this is a better minimum.
+const BETTER: f64 = 0.5;
+/// Fewest rows for each unknown of a piece.
+const LEAST_ROWS: usize = 10;
+
+/// A piece determines a value whose standard deviation is below this, in the scale of the search.
+const CLEAR: f64 = 0.05;
+/// Probability of a false drift, over all unknowns together.
+const FALSE_DRIFT: f64 = 0.01;
+
+/// Values and standard deviations in one piece of the recordings; none where the piece does not determine them.
+pub type Piece = Vec<Option<(f64, f64)>>;
+
+/// Runs with some of the unknowns, the others as in `base`.
+fn restricted(
+    runs: &Runs,
+    base: &[f64],
+    free: &[usize],
+    settings: Settings,
+    run: &mut dyn FnMut(&[Vec<f64>]) -> Vec<Result<Residuals, String>>,
+) -> Result<Answer, Trouble> {
+    let (all, items): (Vec<Unknown>, Vec<Item>) = runs.asked(base);
+    let place = |k: usize| free.iter().position(|other| *other == k);
+    let unknowns: Vec<Unknown> =
+        free.iter().map(|k| Unknown { above: all[*k].above.and_then(place), ..all[*k] }).collect();
+    let mut whole = |_: Way, points: &[Vec<f64>]| {
+        let expanded = points.iter().map(|point| {
+            let mut values = base.to_vec();
+            for (k, value) in free.iter().zip(point) {
+                values[*k] = *value;
+            }
+            values
+        });
+        run(&expanded.collect::<Vec<_>>())
+    };
+    estimate(runs, &unknowns, &items, Settings { starts: Some(1), ..settings }, &mut whole)
+}
+
+/// Fits each of some equal pieces of the recordings, from the answer. Initial values stay as they are.
+pub fn pieces(runs: &Runs, (answer, steps, _): &Found, settings: Settings, count: usize) -> Vec<Piece> {
+    let n = runs.unknowns.len();
+    let rows: usize = runs.parts.iter().map(|part| part.instants.len()).sum();
+    let steady = runs.parts.iter().any(|part| part.asks.steady);
+    if count < 2 || rows < LEAST_ROWS * n * count || steady {
+        return Vec::new();
+    }
+    let (all, _) = runs.asked(&answer.values);
+    let one = |piece: usize| {
+        let mut free: Vec<usize> = (0..n).filter(|k| !runs.unknowns[*k].initial).collect();
+        let mut run = |points: &[Vec<f64>]| {
+            runs.residuals_of(points, steps, &|part: &Part| {
+                let rows = part.instants.len();
+                piece * rows / count..(piece + 1) * rows / count
+            })
+        };
+        while !free.is_empty() {
+            match restricted(runs, &answer.values, &free, settings, &mut run) {
+                Ok(found) => {
+                    let mut values: Piece = vec![None; n];
+                    for (at, k) in free.iter().enumerate() {
+                        // Where the misfit is not quadratic, a standard deviation means little.
+                        let own = found.sd[at] / all[*k].slope(found.values[at]).abs();
+                        let known = own < CLEAR && found.at_bound[at].is_none() && !is_open(&found, at);
+                        values[*k] = known.then_some((found.values[at], found.sd[at]));
+                    }
+                    return values;
+                }
+                Err(Trouble::NoInfluence(idle)) => {
+                    free = free.iter().enumerate().filter(|(at, _)| !idle.contains(at)).map(|(_, k)| *k).collect();
+                }
+                Err(Trouble::NoStart(_) | Trouble::TooFewRows(..)) => break,
+            }
+        }
+        vec![None; n]
+    };
+    (0..count).map(one).collect()
+}
+
+/// How a value scatters over pieces, beside what its standard deviations explain.
+pub struct Scatter {
+    /// Least and greatest value.
+    pub ends: (f64, f64),
+    /// Standard deviation of the values over the pieces.
+    pub sd: f64,
+    /// Number of pieces that determine it.
+    pub pieces: usize,
+    /// Whether the pieces differ by more than their standard deviations allow, at 1 %.
+    pub drifts: bool,
+}
+
+/// The scatter of an unknown over pieces; none if fewer than three determine it.
+pub fn scatter(pieces: &[Piece], k: usize) -> Option<Scatter> {
+    let found: Vec<(f64, f64)> = pieces.iter().filter_map(|piece| piece[k]).collect();
+    let n = found.len();
+    if n < 3 {
+        return None;
+    }
+    let weight: f64 = found.iter().map(|(_, sd)| 1.0 / (sd * sd)).sum();
+    let mean = found.iter().map(|(value, sd)| value / (sd * sd)).sum::<f64>() / weight;
+    let chi_square: f64 = found.iter().map(|(value, sd)| (value - mean) * (value - mean) / (sd * sd)).sum();
+    let middle = found.iter().map(|(value, _)| value).sum::<f64>() / n as f64;
+    let variance = found.iter().map(|(value, _)| (value - middle) * (value - middle)).sum::<f64>() / (n - 1) as f64;
+    let ends =
+        found.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), (value, _)| (a.min(*value), b.max(*value)));
+    let all = pieces[0].len() as f64;
+    let drifts = with(|with| statistics::tail(chi_square, (n - 1) as f64, with)) < FALSE_DRIFT / all;
+    Some(Scatter { ends, sd: variance.sqrt(), pieces: n, drifts })
+}
+
+/// Calls a function with the elementary functions of the language.
+fn with<T>(of: impl FnOnce(&Elementary) -> T) -> T {
+    let (exp, log) = (ElementaryFunction::exp(), ElementaryFunction::log());
+    of(&Elementary { exp: &|x| exp.at(x), log: &|x| log.at(x) })
+}
+
+/// How the misfit grows when a parameter is held and the others are fitted again.
+#[derive(Clone, PartialEq, Debug)]
+pub struct Profile {
+    /// Values in SI, ascending, with the growth of −2 log-likelihood.
+    pub points: Vec<(f64, f64)>,
+    /// Where it has grown by 3.84, within the range.
+    pub ends: (Option<f64>, Option<f64>),
+}
+
+/// −2 log-likelihood, but for a constant.
+fn misfit(runs: &Runs, answer: &Answer, values: &[f64]) -> f64 {
+    let items = runs.parts.iter().flat_map(|part| &part.asks.items);
+    let of = |(k, item): (usize, &crate::compile::FitItem)| {
+        let (noise, residuals) = (&answer.noise[k], &answer.residuals[k]);
+        let n = residuals.len() as f64;
+        with(|with| match item.sd {
+            Some(_) => noise.whitened(residuals).iter().map(|r| r * r).sum::<f64>() + n * (with.log)(noise.innovation),
+            None => n * (with.log)((noise.variance * noise.innovation).max(f64::MIN_POSITIVE)),
+        })
+    };
+    let known = runs.unknowns.iter().zip(values).filter_map(|(unknown, value)| {
+        let (expected, sd) = unknown.known?;
+        Some((value - expected) / sd * ((value - expected) / sd))
+    });
+    items.enumerate().map(of).sum::<f64>() + known.sum::<f64>()
+}
+
+/// The profile of an unknown. An error is a point with a smaller misfit than the answer has.
+pub fn profile(runs: &Runs, (answer, steps, _): &Found, settings: Settings, k: usize) -> Result<Profile, Vec<f64>> {
+    let n = runs.unknowns.len();
+    let unknown = &runs.asked(&answer.values).0[k];
+    let least = misfit(runs, answer, &answer.values);
+    let free: Vec<usize> = (0..n).filter(|other| *other != k).collect();
+    let (low, high) = with(|with| unknown.bounds(with));
+    let middle = with(|with| unknown.coordinate(answer.values[k], with));
+    let own = answer.sd[k] / unknown.slope(answer.values[k]).abs();
+    let first = if own.is_finite() { own } else { f64::INFINITY }.clamp(1e-4 * (high - low), 0.1 * (high - low));
+    let mut points = vec![(answer.values[k], 0.0)];
+    let mut ends = (None, None);
+    for up in [false, true] {
+        let edge = if up { high } else { low };
+        let mut base = answer.values.clone();
+        let mut at = |x: f64, base: &mut Vec<f64>| {
+            base[k] = with(|with| unknown.value(x, with));
+            let rise = rise(runs, answer, steps, settings, (&free, base)) - least;
+            if rise.is_finite() {
+                points.push((base[k], rise.max(0.0)));
+            }
+            rise
+        };
+        let (mut step, mut inner) = (first, (middle, 0.0_f64));
+        let mut outer = None;
+        for _ in 0..MOST_POINTS {
+            let wanted = inner.0 + if up { step } else { -step };
+            let is_last = if up { wanted >= high } else { wanted <= low };
+            let x = if is_last { edge } else { wanted };
+            let rise = at(x, &mut base);
+            if rise < -BETTER {
+                return Err(base);
+            }
+            if rise >= RISE {
+                outer = Some((x, rise));
+                break;
+            }
+            inner = (x, rise.max(0.0));
+            if is_last {
+                break;
+            }
+            step *= 2.0;
+        }
+        let Some(mut outer) = outer else { continue };
+        // The root of the growth is linear in the coordinate near a minimum; where it is not, the middle is as good.
+        let guess = |inner: (f64, f64), outer: (f64, f64)| {
+            let (a, b) = (inner.1.sqrt(), outer.1.min(1e6).sqrt());
+            (RISE.sqrt() - a) / (b - a)
+        };
+        for turn in 0..MOST_REFINEMENTS {
+            if (outer.0 - inner.0).abs() <= 0.02 * (outer.0 - middle).abs() {
+                break;
+            }
+            let part = if turn % 2 == 0 { guess(inner, outer).clamp(0.1, 0.9) } else { 0.5 };
+            let x = inner.0 + part * (outer.0 - inner.0);
+            let rise = at(x, &mut base);
+            if rise >= RISE || rise.is_nan() {
+                outer = (x, rise);
+            } else {
+                inner = (x, rise.max(0.0));
+            }
+        }
+        let x = inner.0 + guess(inner, outer) * (outer.0 - inner.0);
+        let end = Some(with(|with| unknown.value(x, with)));
+        if up { ends.1 = end } else { ends.0 = end }
+    }
+    points.sort_by(|a, b| a.0.total_cmp(&b.0));
+    Ok(Profile { points, ends })
+}
+
+/// The misfit where all unknowns but the free ones are as in `base`; enters what is found into it. Infinite if there is no
+/// answer.
+fn rise(
+    runs: &Runs,
+    answer: &Answer,
+    steps: &[f64],
+    settings: Settings,
+    (free, base): (&[usize], &mut Vec<f64>),
+) -> f64 {
+    if free.is_empty() {
+        return alone(runs, answer, base, steps).unwrap_or(f64::INFINITY);
+    }
+    let mut run = |points: &[Vec<f64>]| runs.residuals(Way::Whole, points, steps);
+    let Ok(found) = restricted(runs, base, free, settings, &mut run) else { return f64::INFINITY };
+    for (at, other) in free.iter().enumerate() {
+        base[*other] = found.values[at];
+    }
+    misfit(runs, &found, base)
+}
+
+/// The misfit with these values, under the noise model of the answer.
+fn alone(runs: &Runs, answer: &Answer, values: &[f64], steps: &[f64]) -> Option<f64> {
+    let residuals = runs.residuals(Way::Whole, &[values.to_vec()], steps).remove(0).ok()?;
+    let scaled = |(noise, rows): (&Noise, &Vec<f64>)| {
+        let whitened = noise.whitened(rows);
+        let part = whitened.iter().map(|r| r * r).sum::<f64>() / whitened.len().max(1) as f64;
+        Noise { variance: noise.variance * part, ..noise.clone() }
+    };
+    let noise: Vec<Noise> = answer.noise.iter().zip(&residuals).map(scaled).collect();
+    let known: Vec<bool> = runs.parts.iter().flat_map(|part| &part.asks.items).map(|item| item.sd.is_some()).collect();
+    let noise = noise.into_iter().zip(&answer.noise).zip(known);
+    let noise = noise.map(|((new, old), known)| if known { old.clone() } else { new }).collect();
+    let changed = Answer { residuals, noise, ..answer.clone() };
+    Some(misfit(runs, &changed, values))
+}
+
+/// What stands out in the residuals of one compared quantity.
+#[derive(Default)]
+pub struct Remarks {
+    /// The quantity on which they depend: its name, and how.
+    pub depends: Option<(String, abi::unit::Unit, Dependence)>,
+    /// Rows that hold most of the error.
+    pub outliers: Option<Outliers>,
+    /// The beginning fits badly.
+    pub begins_badly: bool,
+}
+
+/// Remarks on each compared quantity of a run.
+pub fn remarks(part: &Part, answer: &Answer, items: std::ops::Range<usize>) -> Vec<Remarks> {
+    let rows: Vec<usize> = {
+        let (after, before) = part.asks.window;
+        (0..part.asks.rows.len()).filter(|row| (after..=before).contains(&part.asks.rows[*row])).collect()
+    };
+    let mut names: Vec<(String, abi::unit::Unit)> = Vec::new();
+    let mut columns: Vec<Vec<f64>> = Vec::new();
+    if !part.asks.steady {
+        names.push(("t".into(), abi::unit::Unit::parse("s").expect("it is known")));
+        columns.push(part.instants.clone());
+    }
+    // Residuals depend on what they were computed from.
+    let is_compared =
+        |name: &str| part.asks.items.iter().any(|item| item.sides.iter().flatten().any(|(side, _)| side == name));
+    for (name, unit, values) in part.asks.columns.iter().filter(|(name, ..)| !is_compared(name)) {
+        names.push((name.clone(), unit.clone()));
+        columns.push(rows.iter().map(|row| values[*row]).collect());
+    }
+    let slices: Vec<&[f64]> = columns.iter().map(Vec::as_slice).collect();
+    let one = |k: usize| {
+        let (residuals, noise) = (&answer.residuals[k], &answer.noise[k]);
+        let white = noise.whitened(residuals);
+        let found = with(|with| statistics::dependence(residuals, &white, &slices, with));
+        let depends = found.map(|found| {
+            let (name, unit) = names[found.column].clone();
+            (name, unit, found)
+        });
+        Remarks {
+            depends,
+            outliers: statistics::outliers(residuals, &white),
+            begins_badly: !part.asks.steady && statistics::begins_badly(residuals),
+        }
+    };
+    items.map(one).collect()
+}
