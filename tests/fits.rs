@@ -765,3 +765,78 @@ fn the_report_is_one_page() {
     assert_eq!(page.matches("<svg").count(), page.matches("</svg>").count());
     assert!(page.matches("<svg").count() >= 7, "{}", page.matches("<svg").count());
 }
+
+const SLOT: &str = "import std.interfaces\nimport std.friction\nmodel Bench {\n  input v [m/s]\n  param o = 0 N in -5 N .. 5 N\n  part fr : Friction = CoulombViscous(v = v)\n  output F [N] = fr.F + o\n}\n";
+
+/// A recording of Coulomb and viscous friction, 1.2 N and 2.5 N·s/m, with an offset.
+fn rubbed(seed: u64, offset: f64) -> String {
+    let mut chance = Chance(seed);
+    let row = |n: u32| {
+        let (t, v) = (0.01 * f64::from(n), f64::sin(0.05 * f64::from(n) + 0.1));
+        format!("{t},{v:e},{:e}\n", 2.5 * v + 1.2 * v.signum() + offset + 0.01 * chance.normal())
+    };
+    (0..600).map(row).collect()
+}
+
+/// Alternatives of a slot are fitted each, without the unknowns that they lack, and the true law is first; it goes on as
+/// a text. With the order reversed another law is first.
+#[test]
+fn alternatives_of_a_slot_are_ranked() {
+    let text = format!(
+        "{SLOT}fit f {{\n  run Bench(v = data.v)\n  sweep fr = Coulomb(), CoulombViscous(), StribeckGauss(Fs = 3 N)\n  data \"r.csv\" (t [s], v [m/s], F [N])\n  vary fr.Fc in 0.1 N .. 2.5 N, fr.Fv in 0.1 N·s/m .. 10 N·s/m\n  minimise rms(F - data.F)\n}}\n"
+    );
+    for seed in 0..3 {
+        let folder = folder("slot");
+        fs::write(folder.join("f.fric"), &text).unwrap();
+        fs::write(folder.join("r.csv"), rubbed(seed, 0.0)).unwrap();
+        let output = fric(&folder, &["fit", "f.fric", "--json"]);
+        let lines = String::from_utf8_lossy(&output.stdout);
+        let all: Vec<Value> = lines.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+        assert_eq!(all.len(), 3, "seed {seed}: {output:?}");
+        assert_eq!((&all[0]["alternative"], &all[0]["rank"]), (&Value::from("fr = CoulombViscous()"), &Value::from(1)));
+        let coulomb = all.iter().find(|one| one["alternative"] == "fr = Coulomb()").unwrap();
+        assert_eq!(coulomb["parameters"].as_array().unwrap().len(), 1, "seed {seed}: Coulomb has no Fv");
+        for (k, expected) in [1.2, 2.5].into_iter().enumerate() {
+            let found = &all[0]["parameters"][k];
+            let (value, sd) = (found["value"].as_f64().unwrap(), found["sd"].as_f64().unwrap());
+            assert!((value - expected).abs() < 4.0 * sd, "seed {seed}: {found}");
+        }
+        let output = fric(&folder, &["fit", "f.fric"]);
+        let words = String::from_utf8_lossy(&output.stdout);
+        assert!(words.contains("ΔBIC") && words.contains("  1  fr = CoulombViscous()"), "{words}");
+        let written = fs::read_to_string(folder.join("out/f.fric")).unwrap();
+        assert!(written.contains("fr = CoulombViscous()"), "{written}");
+        let run = fric(&folder, &["run", "out/f.fric", "--no-error"]);
+        assert!(run.status.success(), "seed {seed}: {run:?}");
+    }
+    let wrong = text.replace("fr.Fv", "fr.Fq");
+    let (told, code) = said("slot-wrong", &wrong, &rubbed(0, 0.0), &[]);
+    assert!(code == 1 && told.contains("E0204") && told.contains("`fr.Fq`"), "{told}");
+}
+
+/// A recording that is judged changes no value; its own offset is fitted, what it shares is not. With its own offset left
+/// at its start, the rms is that of the offset.
+#[test]
+fn recordings_are_judged_without_being_fitted() {
+    let fit = |validate: &str| {
+        format!(
+            "{SLOT}fit f {{\n  run Bench(v = data.v)\n  data \"r.csv\" (t [s], v [m/s], F [N])\n  vary fr.Fc in 0.1 N .. 10 N, fr.Fv in 0.1 N·s/m .. 10 N·s/m, o each\n  minimise rms(F - data.F)\n{validate}}}\n"
+        )
+    };
+    for seed in 0..3 {
+        let files = [
+            ("r.csv", rubbed(seed, 0.5)),
+            ("q.csv", rubbed(seed + 10, -1.5)),
+            ("s.csv", rubbed(seed + 20, 0.0).replace(",1.", ",1.1")),
+        ];
+        let files: Vec<(String, String)> = files.map(|(name, rows)| (name.to_string(), rows)).to_vec();
+        let alone = fitted_with("alone", &fit(""), &files);
+        let judged = fitted_with("judged", &fit("  validate \"q.csv\", \"s.csv\"\n"), &files);
+        assert_eq!(alone["parameters"], judged["parameters"], "seed {seed}");
+        let [good, bad] = [0, 1].map(|k| judged["validated"][k]["compared"][0]["rms"].as_f64().unwrap());
+        assert!((good / 0.01 - 1.0).abs() < 0.15, "seed {seed}: {judged}");
+        assert!(bad > 0.015, "seed {seed}: {judged}");
+        let own = judged["validated"][0]["own"][0]["value"].as_f64().unwrap();
+        assert!((own + 1.5).abs() < 0.01, "seed {seed}: {judged}");
+    }
+}

@@ -107,7 +107,8 @@ pub fn varying(
     Ok(variants.into_iter().map(one).collect())
 }
 
-/// Compiles a fit: its experiment for many runs that differ in the values of its unknowns.
+/// Compiles a fit: its experiments for many runs that differ in the values of its unknowns; once for each combination of
+/// its sweeps.
 ///
 /// # Errors All errors of the fit and of the models it runs.
 pub fn fit(
@@ -116,11 +117,17 @@ pub fn fit(
     name: &str,
     options: &Options,
     warnings: &mut Vec<Diagnostic>,
-) -> Result<fit::Fit, Vec<Diagnostic>> {
-    let fit::Read { runs: all, unknowns, name, allowed } =
-        fit::read(loaded, sources, name, &options.changes, warnings)?;
+) -> Result<Vec<fit::Fit>, Vec<Diagnostic>> {
+    let all = fit::read(loaded, sources, name, &options.changes, warnings)?;
+    all.into_iter().map(|read| fitted(loaded, read, options)).collect()
+}
+
+/// Compiles an alternative of a fit.
+fn fitted(loaded: &Loaded, read: fit::Read, options: &Options) -> Result<fit::Fit, Vec<Diagnostic>> {
+    let fit::Read { label, judged, runs: all, unknowns, name, allowed } = read;
+    let judged = judged.into_iter().map(|one| fitted(loaded, one, options)).collect::<Result<_, _>>()?;
     let mut parts = Vec::new();
-    for fit::Run { variant, paths, held, asks } in all {
+    for fit::Run { variant, paths, held, asks, .. } in all {
         if let Some(error) = experiment::vary::built_in(&variant, &paths) {
             return Err(vec![error]);
         }
@@ -137,7 +144,7 @@ pub fn fit(
         });
         parts.push(fit::Part { varying: many(variant, paths, None), held, asks });
     }
-    Ok(fit::Fit { parts, unknowns, name, allowed })
+    Ok(fit::Fit { label, judged, parts, unknowns, name, allowed })
 }
 
 /// Compiles an experiment once for runs that differ in any of its parameters, as [`varying`] does for those that are

@@ -649,6 +649,8 @@ pub enum FitStatement {
     Vary(Vec<Vary>, Span),
     Minimise(Minimise),
     Case(FitCase),
+    /// `validate "third.csv"`: recordings that are judged and not fitted.
+    Validate(Vec<Text>, Span),
 }
 
 /// `case slow { run … data … minimise … }`: one of several kinds of experiment with common unknowns.

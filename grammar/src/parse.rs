@@ -99,7 +99,9 @@ pub fn parse_statements(file: FileId, text: &str) -> (Vec<ExperimentStatement>, 
     let whole = Piece { start: 0, end: reader.source.marks.len() };
     let found = reader.runs(Place::Experiment, whole).into_iter().filter_map(|statement| match statement {
         FitStatement::Experiment(statement) => Some(statement),
-        FitStatement::Vary(..) | FitStatement::Minimise(..) | FitStatement::Case(_) => None,
+        FitStatement::Vary(..) | FitStatement::Minimise(..) | FitStatement::Case(_) | FitStatement::Validate(..) => {
+            None
+        }
     });
     let found = found.collect();
     (found, reader.finish())
@@ -454,7 +456,10 @@ impl<'t> Reader<'t> {
             Place::Experiment => {
                 let body = self.runs(place, inside).into_iter().filter_map(|statement| match statement {
                     FitStatement::Experiment(statement) => Some(statement),
-                    FitStatement::Vary(..) | FitStatement::Minimise(..) | FitStatement::Case(_) => None,
+                    FitStatement::Vary(..)
+                    | FitStatement::Minimise(..)
+                    | FitStatement::Case(_)
+                    | FitStatement::Validate(..) => None,
                 });
                 Item::Experiment(Experiment { name, body: body.collect(), doc, span })
             }
@@ -779,7 +784,7 @@ impl<'t> Reader<'t> {
         for piece in self.source.statements(place, block) {
             let word = self.source.word(piece.start);
             let elsewhere = match place {
-                Place::Experiment => matches!(word, "vary" | "minimise"),
+                Place::Experiment => matches!(word, "vary" | "minimise" | "validate"),
                 Place::Case => matches!(word, "vary" | "case"),
                 _ => false,
             };
@@ -859,6 +864,11 @@ impl<'t> Reader<'t> {
                     let before = if before { items.pop() } else { None };
                     let after = if after { items.pop() } else { None };
                     body.push(FitStatement::Minimise(Minimise { items, after, before, span }));
+                    continue;
+                }
+                Rule::validate => {
+                    let files = children.all(Rule::string).into_iter().map(|file| self.string(file)).collect();
+                    body.push(FitStatement::Validate(files, span));
                     continue;
                 }
                 rule => unreachable!("{rule:?} is no statement of an experiment"),

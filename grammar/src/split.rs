@@ -91,7 +91,7 @@ impl Place {
             Place::Experiment => &["run", "solver", "sweep", "data", "plot", "tune", "expect", "show", "record"],
             Place::Fit | Place::Case => &[
                 "run", "solver", "sweep", "data", "plot", "tune", "expect", "show", "record", "vary", "minimise",
-                "case",
+                "validate", "case",
             ],
             Place::Device => &["send", "read"],
             Place::Rig => &[
@@ -464,7 +464,7 @@ impl<'t> Source<'t> {
         let next = self.word(at + 1);
         match (self.word(at), self.kind(at + 1)) {
             (_, None) => false,
-            ("data", kind) => kind == Some(TokenKind::Text),
+            ("data" | "validate", kind) => kind == Some(TokenKind::Text),
             ("stop", _) => next == "when",
             ("overrun", _) => matches!(next, "stop" | "hold"),
             (_, Some(TokenKind::Word)) => {

@@ -46,11 +46,11 @@ pub const KEYWORDS: [&str; 36] = [
 
 /// Words with a meaning only in experiments, fits, tables, devices and rigs. They are allowed as names, but never a
 /// unit.
-pub const CONTEXT_WORDS: [&str; 46] = [
+pub const CONTEXT_WORDS: [&str; 47] = [
     "after", "against", "as", "at", "before", "bus", "by", "byte", "case", "data", "drive", "each", "expect", "for",
     "from", "hardware", "hold", "limit", "lin", "linear", "log", "message", "minimise", "overrun", "plot", "predict",
     "rate", "read", "record", "rotary", "run", "safe", "scale", "send", "show", "slew", "smooth", "solver", "step",
-    "stop", "sweep", "title", "tol", "tune", "vary", "watchdog",
+    "stop", "sweep", "title", "tol", "tune", "validate", "vary", "watchdog",
 ];
 
 /// Whether `word` is reserved everywhere.

@@ -8,6 +8,7 @@ mod after;
 mod answer;
 mod laws;
 mod page;
+mod rank;
 mod text;
 mod of_laws;
 
@@ -108,12 +109,16 @@ fn one(args: &args::Fit, loaded: &mut Loaded, name: &str, options: &Options, ter
     if !found.is_empty() && !args.quiet && !args.json {
         reported(loaded, &found, terminal);
     }
-    let method = compiled.parts[0].varying.experiment.solver.method;
+    let method = compiled[0].parts[0].varying.experiment.solver.method;
     if let Some(why) = args.stepped.without_effect_and(args.tol, name, method) {
         terminal.error(&why);
         return End::Misused;
     }
+    if compiled.len() > 1 {
+        return alternatives(args, compiled, (loaded, name), options, terminal);
+    }
     let begin = Instant::now();
+    let compiled = compiled.into_iter().next().expect("it has been compiled");
     let runs = Runs::new(compiled, args.threads);
     if args.check {
         return check(args, &runs, loaded, name, terminal);
@@ -132,6 +137,39 @@ fn one(args: &args::Fit, loaded: &mut Loaded, name: &str, options: &Options, ter
     let seconds = begin.elapsed().as_secs_f64();
     let question = Asked { args, file: &args.file, data: &options.changes.data, loaded, name, rank: None };
     conclude(&question, &runs, found, seconds, terminal)
+}
+
+/// Fits each alternative of a fit, ranks them, and shows the best.
+fn alternatives(
+    args: &args::Fit,
+    all: Vec<compile::Fit>,
+    (loaded, name): (&Loaded, &str),
+    options: &Options,
+    terminal: &mut Terminal,
+) -> End {
+    let mut tried = Vec::new();
+    for fit in all {
+        let begin = Instant::now();
+        let runs = Runs::new(fit, args.threads);
+        if args.check {
+            if !args.quiet {
+                terminal.line(&terminal.styled(Style::Bold, &runs.label));
+            }
+            if check(args, &runs, loaded, name, terminal) != End::Fine {
+                return End::Failed;
+            }
+            continue;
+        }
+        let found = search(&runs, Settings::of(args));
+        let held_out = found.as_ref().ok().and_then(|found| after::held_out(&runs, found, Settings::of(args)));
+        let (name, law) = (name.to_string(), runs.label.clone());
+        tried.push(rank::Tried { name, law, runs, found, held_out, seconds: begin.elapsed().as_secs_f64() });
+    }
+    if args.check {
+        return End::Fine;
+    }
+    let heading = rank::Heading { title: name, wrote: None };
+    rank::rank(args, &heading, (&args.file, &options.changes.data), loaded, &tried, terminal)
 }
 
 /// A fit that has been searched for.
@@ -154,9 +192,16 @@ fn conclude(question: &Asked, runs: &Runs, found: Found, seconds: f64, terminal:
     let settings = Settings::of(args);
     let (found, profiles) = profiled(args, runs, found, settings);
     let pieces = after::pieces(runs, &found, settings, args.pieces);
+    let validated = after::judge(runs, &found, settings);
     let (answer, steps, note) = found;
     let mut fitted = Fitted::new(name, runs, answer, &steps, args.level, seconds + begin.elapsed().as_secs_f64());
     (fitted.profiles, fitted.pieces) = (profiles, pieces);
+    for (one, runs) in validated.into_iter().zip(&runs.judged) {
+        match one {
+            Ok(one) => fitted.judged.push(one),
+            Err(why) => fitted.notes.push(format!("{} cannot be judged: {why}", runs.parts[0].asks.label)),
+        }
+    }
     fitted.notes.extend(note);
     fitted.rank = rank;
     let mut outcomes = Vec::new();
@@ -307,6 +352,8 @@ pub fn verdicts(loaded: &mut Loaded, name: &str, interpret: bool, terminal: &Ter
             return None;
         }
     };
+    // Of several alternatives the first one is judged.
+    let compiled = compiled.into_iter().next().expect("it has been compiled");
     let runs = Runs::new(compiled, None);
     let settings = Settings { level: args::LEVEL, starts: None, seed: 0 };
     let (answer, steps, _) = match search(&runs, settings) {

@@ -40,13 +40,20 @@ pub struct Part {
     pub case: usize,
     /// Index of the recording of the case.
     pub recording: usize,
+    /// The recording is one of those that are judged and not fitted.
+    pub judged: bool,
+    /// Index of the combination of the sweeps of the fit.
+    pub alternative: usize,
 }
 
 /// The cases of a fit.
 pub fn cases(fit: &ast::Fit) -> impl Iterator<Item = &ast::FitCase> {
     fit.body.iter().filter_map(|statement| match statement {
         FitStatement::Case(case) => Some(case),
-        FitStatement::Experiment(_) | FitStatement::Vary(..) | FitStatement::Minimise(_) => None,
+        FitStatement::Experiment(_)
+        | FitStatement::Vary(..)
+        | FitStatement::Minimise(_)
+        | FitStatement::Validate(..) => None,
     })
 }
 
@@ -65,10 +72,27 @@ pub fn recordings(fit: &ast::Fit, case: usize) -> Vec<ast::Text> {
     data.map_or(Vec::new(), |data| std::iter::once(&data.file).chain(&data.more).cloned().collect())
 }
 
+/// The recordings of a case that are judged and not fitted.
+pub fn judged(fit: &ast::Fit, case: usize) -> Vec<ast::Text> {
+    let files = statements(fit, case).flat_map(|statement| match statement {
+        FitStatement::Validate(files, _) => &files[..],
+        FitStatement::Experiment(_) | FitStatement::Vary(..) | FitStatement::Minimise(_) | FitStatement::Case(_) => &[],
+    });
+    files.cloned().collect()
+}
+
+/// The runs of a fit against recordings that are not fitted.
+pub fn judgements(fit: &ast::Fit) -> Vec<Part> {
+    let of = |case| {
+        (0..judged(fit, case).len()).map(move |recording| Part { case, recording, judged: true, alternative: 0 })
+    };
+    (0..cases(fit).count().max(1)).flat_map(of).collect()
+}
+
 /// The runs of a fit; at least one for each case. `given`: files that replace its recordings.
 pub fn runs(fit: &ast::Fit, given: &[String]) -> Vec<Part> {
     let recordings = |case| if given.is_empty() { recordings(fit, case).len() } else { given.len() };
-    let of = |case| (0..recordings(case).max(1)).map(move |recording| Part { case, recording });
+    let of = |case| (0..recordings(case).max(1)).map(move |recording| Part { case, recording, ..Part::default() });
     (0..cases(fit).count().max(1)).flat_map(of).collect()
 }
 
@@ -76,6 +100,9 @@ pub fn runs(fit: &ast::Fit, given: &[String]) -> Vec<Part> {
 pub fn single(fit: &ast::Fit, part: &Part, given: &[String]) -> ast::Fit {
     let file = |data: &ast::Data| {
         let all = std::iter::once(&data.file).chain(&data.more).collect::<Vec<_>>();
+        if part.judged {
+            return judged(fit, part.case)[part.recording].clone();
+        }
         match given.get(part.recording) {
             Some(other) => ast::Text { text: other.clone(), ..data.file.clone() },
             None => (*all.get(part.recording).unwrap_or(&all[0])).clone(),
@@ -101,7 +128,10 @@ pub fn own_unknowns(fit: &ast::Fit) -> Vec<&ast::Vary> {
     let Some(run) = run else { return Vec::new() };
     let all = fit.body.iter().flat_map(|statement| match statement {
         FitStatement::Vary(all, _) => &all[..],
-        FitStatement::Experiment(_) | FitStatement::Minimise(_) | FitStatement::Case(_) => &[],
+        FitStatement::Experiment(_)
+        | FitStatement::Minimise(_)
+        | FitStatement::Case(_)
+        | FitStatement::Validate(..) => &[],
     });
     let is_own = |vary: &&ast::Vary| {
         let name = vary.path.single().filter(|_| !vary.initial);
@@ -147,7 +177,7 @@ pub fn experiment_of(fit: &ast::Fit) -> ast::Experiment {
     for statement in &fit.body {
         match statement {
             FitStatement::Experiment(one) => body.push(one.clone()),
-            FitStatement::Vary(..) | FitStatement::Case(_) => {}
+            FitStatement::Vary(..) | FitStatement::Case(_) | FitStatement::Validate(..) => {}
             FitStatement::Minimise(minimise) => {
                 for item in &minimise.items {
                     let Some((of, _)) = compared(item) else { continue };

@@ -22,8 +22,12 @@ use grammar::ast::{self, ExperimentStatement, Expr, FitStatement};
 use grammar::diagnostic::Diagnostic;
 use grammar::span::Span;
 
-/// A fit, compiled.
+/// A fit, compiled; of several alternatives, one of them.
 pub struct Fit {
+    /// The alternative: `fr = LuGre()`; empty if there is one only.
+    pub label: String,
+    /// Recordings that are judged and not fitted, each with the unknowns that the fit shares, and those of its own.
+    pub judged: Vec<Fit>,
     /// Its runs: each recording of each case.
     pub parts: Vec<Part>,
     /// The unknown parameters, of all runs together.
@@ -113,12 +117,18 @@ pub struct Run {
     pub paths: Vec<String>,
     /// The same, held to its recording.
     pub held: Option<Variant>,
+    /// Number of alternatives.
+    alternatives: usize,
     /// What it asks.
     pub asks: Asks,
 }
 
-/// A fit, lowered.
+/// A fit, lowered; of several alternatives, one of them.
 pub struct Read {
+    /// The alternative: `fr = LuGre()`; empty if there is one only.
+    pub label: String,
+    /// Recordings that are judged and not fitted.
+    pub judged: Vec<Read>,
     /// Its runs.
     pub runs: Vec<Run>,
     /// The unknown parameters.
@@ -142,7 +152,11 @@ pub fn single(fit: &ast::Fit, part: of_fit::Part) -> ast::Fit {
     of_fit::single(fit, &part, &[])
 }
 
-/// Reads a fit: the experiments that it runs with its unknowns variable, and what it asks.
+/// Most alternatives of a fit.
+const MOST_ALTERNATIVES: usize = 64;
+
+/// Reads a fit: the experiments that it runs with its unknowns variable, and what it asks; once for each combination of
+/// its sweeps.
 ///
 /// # Errors All errors of the fit and of the models it runs.
 pub fn read(
@@ -151,22 +165,88 @@ pub fn read(
     name: &str,
     changes: &Changes,
     warnings: &mut Vec<Diagnostic>,
-) -> Result<Read, Vec<Diagnostic>> {
+) -> Result<Vec<Read>, Vec<Diagnostic>> {
     let Some(fit) = find(loaded, name).cloned() else {
         let error = Diagnostic::error("E0201", format!("there is no fit `{name}`"));
         return Err(vec![error.label(Span::new(loaded.root(), 0, 0), "in this file")]);
     };
-    let places = of_fit::runs(&fit, &changes.data);
-    let labels = labels(&fit, &places, &changes.data);
+    let (mut all, mut missing): (Vec<Read>, Vec<Vec<Span>>) = (Vec::new(), Vec::new());
+    let mut count = 1;
+    while all.len() < count {
+        let asked = Asked { fit: &fit, changes, alternative: all.len(), lenient: true };
+        let mut found = Vec::new();
+        let mut lacks = Vec::new();
+        let (read, alternatives) = alternative(loaded, sources, &asked, &mut found, &mut lacks)?;
+        warnings.extend(found.into_iter().filter(|one| !warnings.contains(one)).collect::<Vec<_>>());
+        count = alternatives;
+        if count > MOST_ALTERNATIVES {
+            let error = Diagnostic::error("E0902", format!("{count} alternatives are too many"));
+            let error = error.label(fit.name.span, "so many combinations of its sweeps");
+            return Err(vec![error.help(format!("up to {MOST_ALTERNATIVES} can be ranked"))]);
+        }
+        all.push(read);
+        missing.push(lacks);
+    }
+    // An unknown that some alternatives lack is not theirs; one that all lack is a mistake.
+    let lost = |span: &&Span| missing.iter().all(|lacks| lacks.contains(span));
+    if missing[0].iter().any(|span| lost(&span)) {
+        let asked = Asked { fit: &fit, changes, alternative: 0, lenient: false };
+        return match alternative(loaded, sources, &asked, &mut Vec::new(), &mut Vec::new()) {
+            Err(errors) => Err(errors),
+            Ok(_) => unreachable!("an unknown is missing"),
+        };
+    }
+    Ok(all)
+}
+
+/// One alternative of a fit.
+struct Asked<'a> {
+    fit: &'a ast::Fit,
+    changes: &'a Changes,
+    alternative: usize,
+    /// An unknown that it lacks is left out.
+    lenient: bool,
+}
+
+/// Reads one alternative of a fit; returns it with the number of all. `missing`: unknowns that it lacks.
+fn alternative(
+    loaded: &mut Loaded,
+    sources: &dyn Sources,
+    asked: &Asked,
+    warnings: &mut Vec<Diagnostic>,
+    missing: &mut Vec<Span>,
+) -> Result<(Read, usize), Vec<Diagnostic>> {
+    let Asked { fit, changes, .. } = *asked;
+    let places = of_fit::runs(fit, &changes.data);
+    let (mut read, alternatives) = part(loaded, sources, asked, &places, warnings, missing)?;
+    for place in of_fit::judgements(fit) {
+        let (one, _) = part(loaded, sources, asked, &[place], warnings, &mut Vec::new())?;
+        read.judged.push(one);
+    }
+    Ok((read, alternatives))
+}
+
+/// Reads some runs of a fit, with their unknowns.
+fn part(
+    loaded: &mut Loaded,
+    sources: &dyn Sources,
+    asked: &Asked,
+    places: &[of_fit::Part],
+    warnings: &mut Vec<Diagnostic>,
+    missing: &mut Vec<Span>,
+) -> Result<(Read, usize), Vec<Diagnostic>> {
+    let Asked { fit, changes, alternative, lenient } = *asked;
+    let labels = labels(fit, places, &changes.data);
     let mut diagnostics = Vec::new();
     let mut found: Vec<(Run, ast::Fit)> = Vec::new();
     for (place, (label, recording)) in places.iter().zip(labels) {
-        let single = of_fit::single(&fit, place, &changes.data);
-        let changes = Changes { part: *place, ..changes.clone() };
-        let kind = if of_fit::cases(&fit).next().is_some() { "case" } else { "fit" };
-        match run(loaded, sources, (name, kind), &changes, &single, warnings) {
+        let place = of_fit::Part { alternative, ..*place };
+        let single = of_fit::single(fit, &place, &changes.data);
+        let changes = Changes { part: place, ..changes.clone() };
+        let kind = if of_fit::cases(fit).next().is_some() { "case" } else { "fit" };
+        match run(loaded, sources, (&fit.name.text, kind), &changes, &single, warnings) {
             Ok(mut run) => {
-                (run.asks.label, run.asks.recording, run.asks.place) = (label, recording, *place);
+                (run.asks.label, run.asks.recording, run.asks.place) = (label, recording, place);
                 found.push((run, single));
             }
             // The same text gives the same errors for each recording.
@@ -179,26 +259,19 @@ pub fn read(
         return Err(diagnostics);
     }
     let vary: Vec<&ast::Vary> = fit.body.iter().flat_map(varied).collect();
-    let unknowns = unknowns(loaded, &vary, &mut found, &mut diagnostics);
-    let counts: Vec<(usize, usize)> = (0..found.len())
-        .map(|k| {
-            let asks = &found[k].0.asks;
-            let own = unknowns.iter().filter(|unknown| unknown.of == Some(k)).count();
-            (asks.compared * asks.items.len(), own)
-        })
-        .collect();
-    let minimise = found[0].1.body.iter().find_map(|statement| match statement {
-        FitStatement::Minimise(minimise) => Some(minimise.span),
-        FitStatement::Experiment(_) | FitStatement::Vary(..) | FitStatement::Case(_) => None,
-    });
-    let rows: usize = counts.iter().map(|(rows, _)| rows).sum();
-    let place = minimise.unwrap_or(fit.name.span);
-    let few = counts.iter().copied().find(|(rows, own)| rows <= own && *own > 0);
-    let few = few.or((rows <= unknowns.len()).then_some((rows, unknowns.len())));
-    if let Some((rows, unknowns)) = few.filter(|_| diagnostics.is_empty()) {
+    let unknowns = unknowns(loaded, &vary, &mut found, lenient.then_some(missing), &mut diagnostics);
+    let is_judged = places.iter().any(|place| place.judged);
+    if let Some((rows, unknowns)) = few(&found, &unknowns).filter(|_| diagnostics.is_empty() && !is_judged) {
+        let minimise = found[0].1.body.iter().find_map(|statement| match statement {
+            FitStatement::Minimise(minimise) => Some(minimise.span),
+            FitStatement::Experiment(_)
+            | FitStatement::Vary(..)
+            | FitStatement::Case(_)
+            | FitStatement::Validate(..) => None,
+        });
         let [rows, unknowns] = [(rows, "row"), (unknowns, "unknown")].map(counted);
         let message = format!("{rows} cannot determine {unknowns}");
-        let error = Diagnostic::error("E0910", message).label(place, "compared here");
+        let error = Diagnostic::error("E0910", message).label(minimise.unwrap_or(fit.name.span), "compared here");
         diagnostics.push(error.help("compare more rows, or vary fewer parameters"));
     }
     if !diagnostics.is_empty() {
@@ -209,13 +282,29 @@ pub fn read(
         _ => None,
     });
     let allowed = allowed.collect();
-    Ok(Read { runs: found.into_iter().map(|(run, _)| run).collect(), unknowns, name: fit.name.span, allowed })
+    let (label, alternatives) = (found[0].0.variant.label.clone(), found[0].0.alternatives);
+    let runs = found.into_iter().map(|(run, _)| run).collect();
+    Ok((Read { label, judged: Vec::new(), runs, unknowns, name: fit.name.span, allowed }, alternatives))
+}
+
+/// Rows and unknowns, where there are too few rows: of all runs together, or of one for its own unknowns.
+fn few(found: &[(Run, ast::Fit)], unknowns: &[Unknown]) -> Option<(usize, usize)> {
+    let count = |k: usize| {
+        let asks = &found[k].0.asks;
+        let own = unknowns.iter().filter(|unknown| unknown.of == Some(k)).count();
+        (asks.compared * asks.items.len(), own)
+    };
+    let counts: Vec<(usize, usize)> = (0..found.len()).map(count).collect();
+    let rows: usize = counts.iter().map(|(rows, _)| rows).sum();
+    let few = counts.iter().copied().find(|(rows, own)| rows <= own && *own > 0);
+    few.or((rows <= unknowns.len()).then_some((rows, unknowns.len())))
 }
 
 /// What each run is called, and its recording as written. Names that occur twice are numbered.
 fn labels(fit: &ast::Fit, places: &[of_fit::Part], given: &[String]) -> Vec<(String, String)> {
     let case = |place: &of_fit::Part| of_fit::cases(fit).nth(place.case).map(|case| case.name.text.clone());
-    let recording = |place: &of_fit::Part| match given.get(place.recording) {
+    let recording = |place: &of_fit::Part| match given.get(place.recording).filter(|_| !place.judged) {
+        None if place.judged => of_fit::judged(fit, place.case)[place.recording].text.clone(),
         Some(file) => file.clone(),
         None => {
             of_fit::recordings(fit, place.case).get(place.recording).map_or(String::new(), |file| file.text.clone())
@@ -248,15 +337,20 @@ fn labels(fit: &ast::Fit, places: &[of_fit::Part], given: &[String]) -> Vec<(Str
 fn varied(statement: &FitStatement) -> &[ast::Vary] {
     match statement {
         FitStatement::Vary(all, _) => all,
-        FitStatement::Experiment(_) | FitStatement::Minimise(_) | FitStatement::Case(_) => &[],
+        FitStatement::Experiment(_)
+        | FitStatement::Minimise(_)
+        | FitStatement::Case(_)
+        | FitStatement::Validate(..) => &[],
     }
 }
 
-/// The unknowns of all runs; enters their slots into the runs.
+/// The unknowns of all runs; enters their slots into the runs. `missing`: collects those that no run has, which otherwise
+/// are errors.
 fn unknowns(
     loaded: &Loaded,
     vary: &[&ast::Vary],
     runs: &mut [(Run, ast::Fit)],
+    mut missing: Option<&mut Vec<Span>>,
     diagnostics: &mut Vec<Diagnostic>,
 ) -> Vec<Unknown> {
     let mut all: Vec<Unknown> = Vec::new();
@@ -265,6 +359,10 @@ fn unknowns(
         let systems: Vec<String> = runs.iter().map(|(_, single)| system_path(one, &path, single)).collect();
         let has = |k: usize| unknown::exists(&runs[k].0.variant.program.description, one, &systems[k]);
         let mut with: Vec<usize> = (0..runs.len()).filter(|k| has(*k)).collect();
+        if let (true, Some(missing)) = (with.is_empty(), &mut missing) {
+            missing.push(one.span);
+            continue;
+        }
         if with.is_empty() {
             // The first run says what is wrong.
             with.push(0);
@@ -340,9 +438,10 @@ fn run(
     let mut first_warnings = Vec::new();
     let first = experiment::read(loaded, sources, name, &changes, &mut first_warnings, &mut |_| ());
     // A parameter that is computed from others, or has no value, is assigned one, as in a sweep.
+    let at = changes.part.alternative;
     let missing: Vec<usize> = match &first {
         Ok(variants) => {
-            let description = &variants[0].program.description;
+            let description = &variants[at].program.description;
             let is_open = |path: &String| {
                 param_of(description, path).is_none()
                     && description.quantity(path).is_some_and(|found| found.kind != Kind::State)
@@ -370,7 +469,8 @@ fn run(
             }
         }
     };
-    let mut variant = variants.into_iter().next().expect("there is one combination");
+    let alternatives = variants.len();
+    let mut variant = variants.into_iter().nth(at).expect("there are as many combinations as at first");
     let mut diagnostics = Vec::new();
     let asks = asks(loaded, &parts, &variant, solver_given, &mut diagnostics);
     let Some(asks) = asks.filter(|_| diagnostics.is_empty()) else { return Err(diagnostics) };
@@ -387,14 +487,14 @@ fn run(
             let vary = paths.iter().cloned().chain([held::POLE.to_string()]).collect();
             let changes = Changes { held: true, vary, any_step: true, ..changes };
             let read = experiment::read(loaded, sources, name, &changes, &mut Vec::new(), &mut |_| ());
-            let held = read.ok().and_then(|variants| variants.into_iter().next()).filter(|held| held.held);
+            let held = read.ok().and_then(|variants| variants.into_iter().nth(at)).filter(|held| held.held);
             held.map(|mut held| {
                 window(&mut held.experiment);
                 held
             })
         }
     };
-    Ok(Run { variant, paths, held, asks })
+    Ok(Run { variant, paths, held, alternatives, asks })
 }
 
 fn has_solver(fit: &ast::Fit) -> bool {
@@ -414,14 +514,9 @@ fn parts<'a>(fit: &'a ast::Fit, kind: &str) -> Result<Parts<'a>, Vec<Diagnostic>
         match statement {
             FitStatement::Vary(all, _) => vary.extend(all),
             FitStatement::Minimise(one) => minimise.push(one),
-            FitStatement::Case(_) => {}
+            FitStatement::Case(_) | FitStatement::Validate(..) => {}
             FitStatement::Experiment(ExperimentStatement::Run(one)) => runs.push(one),
             FitStatement::Experiment(ExperimentStatement::Data(one)) => data.push(one.span),
-            FitStatement::Experiment(ExperimentStatement::Sweep(one)) => {
-                let error =
-                    Diagnostic::error("E0905", "a fit cannot sweep yet").label(one.span, "several laws at once");
-                diagnostics.push(error.help("write a fit for each law"));
-            }
             FitStatement::Experiment(ExperimentStatement::Record(one)) => {
                 let error =
                     Diagnostic::error("E0905", "a fit writes what it compares").label(one.span, "not for a fit");
@@ -429,6 +524,7 @@ fn parts<'a>(fit: &'a ast::Fit, kind: &str) -> Result<Parts<'a>, Vec<Diagnostic>
             }
             FitStatement::Experiment(
                 ExperimentStatement::Solver(_)
+                | ExperimentStatement::Sweep(_)
                 | ExperimentStatement::Plot(_)
                 | ExperimentStatement::Tune(..)
                 | ExperimentStatement::Expect(_)

@@ -7,6 +7,7 @@
 use super::answer::is_open;
 use super::search::{Found, Part, Runs, Settings, estimate};
 use crate::compile::ElementaryFunction;
+use runtime::fit::ranking;
 use runtime::fit::statistics::{self, Dependence, Outliers};
 use runtime::fit::{Answer, Elementary, Item, Noise, Residuals, Trouble, Unknown, Way};
 
@@ -66,9 +67,9 @@ pub fn pieces(runs: &Runs, (answer, steps, _): &Found, settings: Settings, count
     let one = |piece: usize| {
         let mut free: Vec<usize> = (0..n).filter(|k| !runs.unknowns[*k].initial).collect();
         let mut run = |points: &[Vec<f64>]| {
-            runs.residuals_of(points, steps, &|part: &Part| {
+            runs.residuals_at(points, steps, &|part: &Part| {
                 let rows = part.instants.len();
-                piece * rows / count..(piece + 1) * rows / count
+                (piece * rows / count..(piece + 1) * rows / count).collect()
             })
         };
         while !free.is_empty() {
@@ -141,7 +142,7 @@ pub struct Profile {
 }
 
 /// −2 log-likelihood, but for a constant.
-fn misfit(runs: &Runs, answer: &Answer, values: &[f64]) -> f64 {
+pub fn misfit(runs: &Runs, answer: &Answer, values: &[f64]) -> f64 {
     let items = runs.parts.iter().flat_map(|part| &part.asks.items);
     let of = |(k, item): (usize, &crate::compile::FitItem)| {
         let (noise, residuals) = (&answer.noise[k], &answer.residuals[k]);
@@ -262,6 +263,77 @@ fn alone(runs: &Runs, answer: &Answer, values: &[f64], steps: &[f64]) -> Option<
     let noise = noise.map(|((new, old), known)| if known { old.clone() } else { new }).collect();
     let changed = Answer { residuals, noise, ..answer.clone() };
     Some(misfit(runs, &changed, values))
+}
+
+/// A recording that was judged and not fitted.
+pub struct Judged {
+    /// What it is called.
+    pub label: String,
+    /// Values of the unknowns that are its own, by their labels.
+    pub own: Vec<(String, f64, abi::unit::Unit)>,
+    /// What the fit leaves of it, for each compared quantity.
+    pub residuals: Residuals,
+}
+
+/// Judges the recordings that are not fitted: with the values found, and those that are their own fitted.
+pub fn judge(runs: &Runs, (answer, steps, _): &Found, settings: Settings) -> Vec<Result<Judged, String>> {
+    let one = |judged: &Runs| {
+        let part = &judged.parts[0];
+        // The steps are those of a fitted run of the same case.
+        let same = runs.parts.iter().position(|other| other.asks.place.case == part.asks.place.case);
+        let ratio =
+            same.map_or(1.0, |k| if runs.parts[k].step() > 0.0 { steps[k] / runs.parts[k].step() } else { 1.0 });
+        let steps = vec![part.step() * ratio];
+        let value = |unknown: &crate::compile::FitUnknown| {
+            let shared = |(other, _): &(&crate::compile::FitUnknown, &f64)| other.span == unknown.span;
+            let found = runs.unknowns.iter().zip(&answer.values).find(shared).map(|(_, value)| *value);
+            found.filter(|_| unknown.of.is_none()).unwrap_or(unknown.start)
+        };
+        let mut values: Vec<f64> = judged.unknowns.iter().map(value).collect();
+        let own: Vec<usize> = (0..values.len()).filter(|k| judged.unknowns[*k].of.is_some()).collect();
+        if !own.is_empty() {
+            let mut run = |points: &[Vec<f64>]| judged.residuals(Way::Whole, points, &steps);
+            let found = restricted(judged, &values, &own, settings, &mut run);
+            for (at, k) in own.iter().enumerate() {
+                if let Ok(found) = &found {
+                    values[*k] = found.values[at];
+                }
+            }
+        }
+        let residuals = judged.residuals(Way::Whole, &[values.clone()], &steps).remove(0)?;
+        let own = own.iter().map(|k| (judged.unknowns[*k].label.clone(), values[*k], judged.unknowns[*k].unit.clone()));
+        Ok(Judged { label: part.asks.label.clone(), own: own.collect(), residuals })
+    };
+    runs.judged.iter().map(one).collect()
+}
+
+/// What a fit leaves of rows that it has not seen, for each compared quantity: of the recordings that are judged, else of
+/// each half of the rows when it is fitted to the other half.
+pub fn held_out(runs: &Runs, found: &Found, settings: Settings) -> Option<Residuals> {
+    if !runs.judged.is_empty() {
+        let all: Result<Vec<Judged>, String> = judge(runs, found, settings).into_iter().collect();
+        return Some(all.ok()?.into_iter().flat_map(|one| one.residuals).collect());
+    }
+    let (answer, steps, _) = found;
+    let seen = |part: &Part, half: usize| -> Vec<usize> {
+        let rows = part.instants.len();
+        (0..rows).filter(|row| ranking::piece(*row, rows, part.asks.steady) % 2 == half).collect()
+    };
+    let mut out: Residuals = answer.residuals.iter().map(|rows| vec![0.0; rows.len()]).collect();
+    let free: Vec<usize> = (0..runs.unknowns.len()).collect();
+    for half in [0, 1] {
+        let mut run = |points: &[Vec<f64>]| runs.residuals_at(points, steps, &|part| seen(part, half));
+        let values = restricted(runs, &answer.values, &free, settings, &mut run).ok()?.values;
+        let all = runs.residuals(Way::Whole, &[values], steps).remove(0).ok()?;
+        for (part, items) in runs.parts.iter().zip(runs.items()) {
+            for k in items {
+                for row in seen(part, 1 - half) {
+                    out[k][row] = all[k][row];
+                }
+            }
+        }
+    }
+    Some(out)
 }
 
 /// What stands out in the residuals of one compared quantity.

@@ -1,6 +1,6 @@
 //! The answer of a fit in words, as JSON and as a table.
 
-use super::after::{Piece, Profile, Remarks, scatter};
+use super::after::{Judged, Piece, Profile, Remarks, scatter};
 use super::page;
 use super::search::{Part, Runs};
 use crate::compile::{Asks, ElementaryFunction, FitItem, FitUnknown, HELD};
@@ -36,6 +36,8 @@ pub struct Fitted {
     pub pieces: Vec<Piece>,
     /// The profile of each unknown, where it was computed.
     pub profiles: Vec<Option<Profile>>,
+    /// Recordings that were judged and not fitted.
+    pub judged: Vec<Judged>,
     /// Each model with the values found, to paste.
     pub instances: Vec<String>,
     /// The values found, each as `--set` takes it.
@@ -101,6 +103,7 @@ impl Fitted {
             runs: Vec::new(),
             pieces: Vec::new(),
             profiles: Vec::new(),
+            judged: Vec::new(),
             level,
             seconds,
             rank: None,
@@ -280,7 +283,8 @@ impl Fitted {
         }
         heading.push(format!("{n} {}", if n == 1 { "unknown" } else { "unknowns" }));
         heading.extend(self.solver_of_all());
-        let mut out = format!("  {}: {}\n", models(runs), heading.join(", "));
+        let law = if runs.label.is_empty() { String::new() } else { format!(", {}", runs.label) };
+        let mut out = format!("  {}{law}: {}\n", models(runs), heading.join(", "));
         let starts = match answer.starts {
             1 => String::new(),
             n => format!("{} starts, {} followed, {} ended here; ", count(n as u64), answer.followed, answer.agreed),
@@ -365,6 +369,13 @@ impl Fitted {
                 out += &format!("{indent}rms({})  {rms}, {colour}{of_given}\n", item.text);
             }
             out += &results::verdicts(terminal, &run.verdicts, None, None, indent);
+        }
+        for (one, judged) in self.judged.iter().zip(&runs.judged) {
+            let items = judged.parts[0].asks.items.iter().zip(&one.residuals);
+            let each = items.map(|(item, rows)| format!("rms({})  {}", item.text, show(rms(rows), &item.unit, 4)));
+            let own = one.own.iter().map(|(label, value, unit)| format!("{label} {}", show(*value, unit, 4)));
+            let all: Vec<String> = each.chain(own).collect();
+            out += &format!("  validate {}: {}\n", one.label, all.join(", "));
         }
         for note in &self.notes {
             out += &format!("  note: {note}\n");
@@ -498,7 +509,22 @@ impl Fitted {
             "file": file.display().to_string(),
             "fit": self.name,
             "model": models(runs),
+            "alternative": (!runs.label.is_empty()).then_some(&runs.label),
             "recordings": recordings,
+            "validated": self.judged.iter().zip(&runs.judged).map(|(one, judged)| json!({
+                "label": one.label,
+                "own": one.own.iter().map(|(label, value, unit)| json!({
+                    "label": label,
+                    "value": number(unit.from_si(*value)),
+                    "unit": unit.text,
+                })).collect::<Vec<_>>(),
+                "compared": judged.parts[0].asks.items.iter().zip(&one.residuals).map(|(item, rows)| json!({
+                    "text": item.text,
+                    "rms": width(&item.unit, rms(rows)),
+                    "unit": item.unit.text,
+                    "rows": rows.len(),
+                })).collect::<Vec<_>>(),
+            })).collect::<Vec<_>>(),
             "converged": self.converged(),
             "passed": self.runs.iter().flat_map(|run| &run.verdicts).all(Verdict::passed),
             "level": self.level,
@@ -549,6 +575,10 @@ fn change(open: &Combination, k: usize, unknown: &FitUnknown) -> Option<String> 
         true => format!("{name} / {}", significant(ElementaryFunction::exp().at(size), 2)),
         false => format!("{name} {sign} {}", show(size * (high - low), &unknown.unit, 2)),
     })
+}
+
+fn rms(rows: &[f64]) -> f64 {
+    (rows.iter().map(|r| r * r).sum::<f64>() / rows.len().max(1) as f64).sqrt()
 }
 
 /// The models that are run, each once.

@@ -10,7 +10,7 @@ use abi::plan::{Experiment, Method};
 use abi::{Instance, Slot};
 use grammar::span::Span;
 use runtime::engine::{self, Cause, Continue, Failure, lanes};
-use runtime::fit::{Answer, Elementary, Item, Minima, Question, Trouble, Unknown, Way, ranking};
+use runtime::fit::{Answer, Elementary, Item, Minima, Question, Trouble, Unknown, Way};
 use std::ops::Range;
 
 /// Most trial points of a stage of the search.
@@ -24,6 +24,10 @@ const HELD_TOL: f64 = 1e-5;
 
 /// The compiled fit and its rows.
 pub struct Runs {
+    /// The alternative, of a fit with a sweep: `fr = LuGre()`.
+    pub label: String,
+    /// Runs against recordings that are judged and not fitted.
+    pub judged: Vec<Runs>,
     /// Each recording of each case.
     pub parts: Vec<Part>,
     /// The unknown parameters.
@@ -208,7 +212,7 @@ impl Part {
 
     /// Compared minus recorded at these rows, for each of these sets of values of all unknowns. Values on which this
     /// recording does not depend cost no run.
-    fn residuals_at(&self, way: Way, points: &[Vec<f64>], step: f64, instants: &[f64]) -> Vec<Residuals> {
+    pub(super) fn residuals_at(&self, way: Way, points: &[Vec<f64>], step: f64, instants: &[f64]) -> Vec<Residuals> {
         let slots = match (way, &self.held) {
             (Way::Held(_), Some(held)) => &held.slots,
             _ => &self.slots,
@@ -261,9 +265,11 @@ impl Part {
 impl Runs {
     /// The runs of a fit.
     pub fn new(fit: compile::Fit, threads: Option<usize>) -> Runs {
-        let compile::Fit { parts, unknowns, name, allowed } = fit;
+        let compile::Fit { label, judged, parts, unknowns, name, allowed } = fit;
+        let judged = judged.into_iter().map(|fit| Runs::new(fit, threads)).collect();
         let threads = threads.unwrap_or_else(|| std::thread::available_parallelism().map_or(1, usize::from));
-        Runs { parts: parts.into_iter().map(|part| Part::new(part, threads)).collect(), unknowns, name, allowed }
+        let parts = parts.into_iter().map(|part| Part::new(part, threads)).collect();
+        Runs { label, judged, parts, unknowns, name, allowed }
     }
 
     /// The steps as the text has them.
@@ -326,13 +332,16 @@ impl Runs {
     }
 
     /// The same at some of the compared rows of each recording.
-    pub fn residuals_of(
+    pub fn residuals_at(
         &self,
         points: &[Vec<f64>],
         steps: &[f64],
-        rows: &dyn Fn(&Part) -> Range<usize>,
+        rows: &dyn Fn(&Part) -> Vec<usize>,
     ) -> Vec<Residuals> {
-        let of = |(part, step): (&Part, &f64)| part.residuals_at(Way::Whole, points, *step, &part.instants[rows(part)]);
+        let of = |(part, step): (&Part, &f64)| {
+            let instants: Vec<f64> = rows(part).into_iter().map(|row| part.instants[row]).collect();
+            part.residuals_at(Way::Whole, points, *step, &instants)
+        };
         joined(points.len(), self.parts.iter().zip(steps).map(of))
     }
 }
@@ -494,22 +503,4 @@ fn searched(runs: &Runs, written: &[f64], settings: Settings) -> Result<Found, T
         return Ok((answer, steps, Some(note)));
     }
     unreachable!("the loop returns")
-}
-
-/// What a law leaves of each row of its first recording when it is fitted to the rows of the other half.
-pub fn held_out(runs: &Runs, (answer, steps, _): &Found, settings: Settings) -> Option<Vec<f64>> {
-    let part = &runs.parts[0];
-    let rows = part.instants.len();
-    let half = |row: usize| ranking::piece(row, rows, part.asks.steady) % 2;
-    let mut out = vec![0.0; rows];
-    for seen in [0, 1] {
-        let instants: Vec<f64> = (0..rows).filter(|row| half(*row) == seen).map(|row| part.instants[row]).collect();
-        let of_half = |_: Way, points: &[Vec<f64>]| part.residuals_at(Way::Whole, points, steps[0], &instants);
-        let (unknowns, items) = runs.asked(&answer.values);
-        let values =
-            estimate(runs, &unknowns, &items, Settings { starts: Some(1), ..settings }, &mut { of_half }).ok()?.values;
-        let all = runs.residuals(Way::Whole, &[values], steps).remove(0).ok()?;
-        (0..rows).filter(|row| half(*row) != seen).for_each(|row| out[row] = all[0][row]);
-    }
-    Some(out)
 }

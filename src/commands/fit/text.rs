@@ -165,7 +165,7 @@ fn experiment<'a>(
     let mut window = String::new();
     for statement in &fit.body {
         match statement {
-            FitStatement::Vary(..) | FitStatement::Case(_) => {}
+            FitStatement::Vary(..) | FitStatement::Case(_) | FitStatement::Validate(..) => {}
             FitStatement::Minimise(minimise) => {
                 let edges = [("after", &minimise.after), ("before", &minimise.before)];
                 for (word, edge) in edges.iter().filter_map(|(word, edge)| Some((word, edge.as_ref()?))) {
@@ -209,9 +209,22 @@ fn experiment<'a>(
                     let _ = writeln!(out, "{}", slice(one.span));
                 }
             }
-            FitStatement::Experiment(ExperimentStatement::Sweep(_) | ExperimentStatement::Record(_)) => {
-                unreachable!("a fit has no sweep and no record")
+            FitStatement::Experiment(ExperimentStatement::Sweep(one)) => {
+                // Of the alternatives, the one that was fitted.
+                let paths = fit.body.iter().filter_map(|statement| match statement {
+                    FitStatement::Experiment(ExperimentStatement::Sweep(other)) => Some(slice(other.path.span)),
+                    _ => None,
+                });
+                let starts: Vec<usize> = paths
+                    .filter_map(|path| runs.label.find(&format!("{path} = ")))
+                    .chain([runs.label.len() + 2])
+                    .collect();
+                if let Some(at) = runs.label.find(&format!("{} = ", slice(one.path.span))) {
+                    let end = starts.iter().copied().filter(|start| *start > at).min().unwrap_or(runs.label.len() + 2);
+                    let _ = writeln!(out, "sweep {}", &runs.label[at..end - 2]);
+                }
             }
+            FitStatement::Experiment(ExperimentStatement::Record(_)) => unreachable!("a fit has no record"),
         }
     }
     let _ = writeln!(out, "solver {}", solver.unwrap_or_else(|| as_text(&run.solver)));
