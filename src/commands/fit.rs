@@ -6,8 +6,8 @@
 mod search;
 mod after;
 mod answer;
-mod laws;
 mod page;
+mod laws;
 mod rank;
 mod text;
 mod of_laws;
@@ -287,7 +287,7 @@ fn profiled(
         let is_asked = |k: usize| {
             let unknown = &runs.unknowns[k];
             match &args.profile[..] {
-                [] => answer.at_bound[k].is_some() || answer::is_open(answer, k),
+                [] => answer.at_bound[k].is_some() || after::is_open(answer, k),
                 [one] if one == "none" => false,
                 named => named.iter().any(|one| *one == "all" || *one == unknown.path || *one == unknown.label),
             }
@@ -455,7 +455,7 @@ fn written(
         let point = std::slice::from_ref(&fitted.answer.values);
         if let Ok(values) = part.sampled(point, run.step, &part.instants, &slots).remove(0) {
             files.push((at(&stem, "csv"), answer::table(asks, &part.instants, &values).into_bytes()));
-            shown.push(page::Shown { recording: &outcome.recording, rows: values });
+            shown.push(page::PageRun { recording: &outcome.recording, rows: values });
         }
         let plots = &part.varying.plots;
         if !plots.is_empty() {

@@ -160,9 +160,10 @@ pub fn declared(unknowns: &[&ast::Vary], diagnostics: &mut Vec<Diagnostic>) -> V
             diagnostics.push(error.help("an unknown of the fit itself needs its own: `vary F0 in -1 N .. 1 N`"));
         }
         let name = vary.path.segments[0].name.clone();
-        Some(Declared { path: own_path(&name.text), name, unit: unit?, value: value? })
+        // Without a unit it fits everything, so that one mistake yields one message.
+        Declared { path: own_path(&name.text), name, unit, value: value.unwrap_or(0.0) }
     };
-    unknowns.iter().filter_map(one).collect()
+    unknowns.iter().map(one).collect()
 }
 
 /// The experiment that a fit runs. Its last plot holds the compared differences, each followed by its two sides; its

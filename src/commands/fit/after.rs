@@ -4,13 +4,14 @@
 //! In: runs and their answer. Out: values of pieces, profiles, and what stands out in the residuals. Knows nothing of
 //! words.
 
-use super::answer::is_open;
 use super::search::{Found, Part, Runs, Settings, estimate};
 use crate::compile::ElementaryFunction;
 use runtime::fit::ranking;
 use runtime::fit::statistics::{self, Dependence, Outliers};
 use runtime::fit::{Answer, Elementary, Item, Noise, Residuals, Trouble, Unknown, Way};
 
+/// Components of a combination that count, as a fraction of the largest.
+pub const NAMED: f64 = 0.2;
 /// χ² of one degree of freedom that 5 % exceed: a profile ends where the misfit has grown by it.
 const RISE: f64 = 3.84;
 /// Most points of a profile on each side.
@@ -25,7 +26,7 @@ const LEAST_ROWS: usize = 10;
 /// A piece determines a value whose standard deviation is below this, in the scale of the search.
 const CLEAR: f64 = 0.05;
 /// Probability of a false drift, over all unknowns together.
-const FALSE_DRIFT: f64 = 0.01;
+const FALSE_DRIFT: f64 = 1e-3;
 
 /// Values and standard deviations in one piece of the recordings; none where the piece does not determine them.
 pub type Piece = Vec<Option<(f64, f64)>>;
@@ -53,6 +54,14 @@ fn restricted(
         run(&expanded.collect::<Vec<_>>())
     };
     estimate(runs, &unknowns, &items, Settings { starts: Some(1), ..settings }, &mut whole)
+}
+
+/// Whether an unknown is part of a combination that the data do not determine.
+pub fn is_open(answer: &Answer, k: usize) -> bool {
+    answer.undetermined.iter().any(|open| {
+        let largest = open.direction.iter().map(|c| c.abs()).fold(0.0, f64::max);
+        open.direction[k].abs() >= NAMED * largest
+    })
 }
 
 /// Fits each of some equal pieces of the recordings, from the answer. Initial values stay as they are.
@@ -103,7 +112,7 @@ pub struct Scatter {
     pub sd: f64,
     /// Number of pieces that determine it.
     pub pieces: usize,
-    /// Whether the pieces differ by more than their standard deviations allow, at 1 %.
+    /// Whether the pieces differ by more than their standard deviations allow.
     pub drifts: bool,
 }
 

@@ -1,7 +1,6 @@
 //! The answer of a fit in words, as JSON and as a table.
 
-use super::after::{Judged, Piece, Profile, Remarks, scatter};
-use super::page;
+use super::after::{Judged, NAMED, Piece, Profile, Remarks, scatter};
 use super::search::{Part, Runs};
 use crate::compile::{Asks, ElementaryFunction, FitItem, FitUnknown, HELD};
 use crate::quantity::{count, duration, show, significant};
@@ -10,7 +9,7 @@ use crate::terminal::Terminal;
 use abi::plan::Solver;
 use abi::unit::Unit;
 use grammar::diagnostic::Diagnostic;
-use runtime::fit::statistics::gaps;
+use runtime::fit::statistics::{Dependence, gaps};
 use runtime::fit::{Answer, Combination, Ended};
 use runtime::run::verdict::Verdict;
 use serde_json::{Value, json};
@@ -18,8 +17,6 @@ use std::path::{Path, PathBuf};
 
 /// Correlations above this are shown.
 const CORRELATED: f64 = 0.9;
-/// Components of a combination that are named, as a fraction of the largest.
-const NAMED: f64 = 0.2;
 
 /// Step of the text to go on with, as a part of that of the search.
 const FINER: f64 = 0.25;
@@ -222,7 +219,7 @@ impl Fitted {
                 if let Some((name, unit, found)) = &remarks.depends {
                     let message = format!("what the model leaves of `{}`{of} depends on `{name}`", item.text);
                     let share = significant(100.0 * found.share, 2);
-                    let label = format!("{share} % of its variance, most {}", page::class(found, unit));
+                    let label = format!("{share} % of its variance, most {}", class(found, unit));
                     let warning = Diagnostic::warning("W0903", message).label(runs.name, label);
                     all.push(("model-error", warning.help(
                         "the law lacks something that the recording shows; compare others, or look at the residuals with `--report`",
@@ -231,7 +228,7 @@ impl Fitted {
                 if remarks.outliers.is_some() {
                     let message = format!("few rows hold most of the error of `{}`{of}", item.text);
                     let alone = Remarks { outliers: remarks.outliers.clone(), ..Remarks::default() };
-                    let warning = Diagnostic::warning("W0907", message).label(runs.name, page::said(&alone, part));
+                    let warning = Diagnostic::warning("W0907", message).label(runs.name, said(&alone, part));
                     all.push((
                         "outliers",
                         warning.help("look at them; leave them out with `after` and `before`, or remove the rows"),
@@ -550,14 +547,6 @@ fn ends_of((low, high): (f64, f64), unknown: &FitUnknown) -> String {
     format!("{} .. {}", show(low, &plain(&unknown.unit), 4), show(high, &unknown.unit, 4))
 }
 
-/// Whether an unknown is part of a combination that the data do not determine.
-pub fn is_open(answer: &Answer, k: usize) -> bool {
-    answer.undetermined.iter().any(|open| {
-        let largest = open.direction.iter().map(|c| c.abs()).fold(0.0, f64::max);
-        open.direction[k].abs() >= NAMED * largest
-    })
-}
-
 /// How an unknown changes along a combination that moves the outputs by one standard deviation of their noise, at most
 /// over a tenth of its range: `vs × 2`, `Fs − 1 %`. None if it hardly changes.
 fn change(open: &Combination, k: usize, unknown: &FitUnknown) -> Option<String> {
@@ -663,6 +652,57 @@ fn quoted(cell: &str) -> String {
     match cell.contains([',', '"']) {
         true => format!("\"{}\"", cell.replace('"', "\"\"")),
         false => cell.into(),
+    }
+}
+
+/// Remarks in a few words.
+pub fn said(remarks: &Remarks, part: &Part) -> String {
+    let mut all = Vec::new();
+    if let Some((name, unit, found)) = &remarks.depends {
+        all.push(format!(
+            "depends on {name}: {} % of its variance, most {}",
+            significant(100.0 * found.share, 2),
+            class(found, unit)
+        ));
+    }
+    if let Some(found) = &remarks.outliers {
+        if let [first, .., last] | [first @ last] = &found.rows[..] {
+            let rows = count(found.rows.len() as u64);
+            let what = if found.rows.len() == 1 { "row" } else { "rows" };
+            all.push(format!("{rows} {what} beyond six standard deviations{}", at(part, *first, *last)));
+        }
+        if let Some(rows) = &found.tenth {
+            all.push(format!(
+                "more than half of the squared error lies in a tenth of the rows{}",
+                at(part, rows.start, rows.end - 1)
+            ));
+        }
+    }
+    if remarks.begins_badly {
+        all.push("the beginning fits badly".into());
+    }
+    all.join("; ")
+}
+
+fn at(part: &Part, first: usize, last: usize) -> String {
+    if part.asks.steady {
+        return String::new();
+    }
+    let time = |row: usize| abi::format::time(part.instants[row] + part.asks.begins);
+    if first == last {
+        format!(", at {}", time(first))
+    } else {
+        format!(", between {} and {}", time(first), time(last))
+    }
+}
+
+/// Where a dependence is greatest.
+pub fn class(found: &Dependence, unit: &Unit) -> String {
+    let value = |si: f64| show(si, unit, 3);
+    match found.edge {
+        (true, _) => format!("below {}", value(found.class.1)),
+        (_, true) => format!("above {}", value(found.class.0)),
+        _ => format!("between {} and {}", value(found.class.0), value(found.class.1)),
     }
 }
 

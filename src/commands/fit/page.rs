@@ -2,8 +2,7 @@
 //!
 //! In: an answer, its runs, and the compared rows. Out: a page with inline figures, which loads nothing and runs no script.
 
-use super::after::Remarks;
-use super::answer::Fitted;
+use super::answer::{Fitted, said};
 use super::search::{Part, Runs};
 use crate::characterise::page::{escaped, page, words};
 use crate::figure::{self, Recorded};
@@ -22,7 +21,7 @@ const MOST_POINTS: usize = 4000;
 const LAGS: usize = 40;
 
 /// What a page shows of one recording beside the answer.
-pub struct Shown<'a> {
+pub struct PageRun<'a> {
     /// The run with the values found.
     pub recording: &'a Recording,
     /// The compared rows: of each, all differences, then all sides.
@@ -35,7 +34,7 @@ pub fn report(
     runs: &Runs,
     (title, text): (&str, &str),
     warnings: &[Diagnostic],
-    shown: &[Shown],
+    shown: &[PageRun],
 ) -> String {
     let mut body = String::new();
     let _ = writeln!(body, "<h1>{}</h1>", escaped(title));
@@ -176,57 +175,6 @@ fn compared(fitted: &Fitted, runs: &Runs) -> String {
         }
     }
     out + "</table>\n"
-}
-
-/// Remarks in a few words.
-pub fn said(remarks: &Remarks, part: &Part) -> String {
-    let mut all = Vec::new();
-    if let Some((name, unit, found)) = &remarks.depends {
-        all.push(format!(
-            "depends on {name}: {} % of its variance, most {}",
-            significant(100.0 * found.share, 2),
-            class(found, unit)
-        ));
-    }
-    if let Some(found) = &remarks.outliers {
-        if let [first, .., last] | [first @ last] = &found.rows[..] {
-            let rows = count(found.rows.len() as u64);
-            let what = if found.rows.len() == 1 { "row" } else { "rows" };
-            all.push(format!("{rows} {what} beyond six standard deviations{}", at(part, *first, *last)));
-        }
-        if let Some(rows) = &found.tenth {
-            all.push(format!(
-                "more than half of the squared error lies in a tenth of the rows{}",
-                at(part, rows.start, rows.end - 1)
-            ));
-        }
-    }
-    if remarks.begins_badly {
-        all.push("the beginning fits badly".into());
-    }
-    all.join("; ")
-}
-
-fn at(part: &Part, first: usize, last: usize) -> String {
-    if part.asks.steady {
-        return String::new();
-    }
-    let time = |row: usize| abi::format::time(part.instants[row] + part.asks.begins);
-    if first == last {
-        format!(", at {}", time(first))
-    } else {
-        format!(", between {} and {}", time(first), time(last))
-    }
-}
-
-/// Where a dependence is greatest.
-pub fn class(found: &runtime::fit::statistics::Dependence, unit: &Unit) -> String {
-    let value = |si: f64| show(si, unit, 3);
-    match found.edge {
-        (true, _) => format!("below {}", value(found.class.1)),
-        (_, true) => format!("above {}", value(found.class.0)),
-        _ => format!("between {} and {}", value(found.class.0), value(found.class.1)),
-    }
 }
 
 /// Every n-th of many rows.

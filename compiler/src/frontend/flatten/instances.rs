@@ -327,7 +327,8 @@ impl<'a> Flattener<'a> {
     /// Adds a parameter of the root beside its own; returns its name with a node that reads it.
     pub(super) fn declare_unknown(&mut self, declared: &Declared) -> (String, ExprId) {
         let (name, unit, place) = (&declared.name, declared.unit.clone(), declared.name.span);
-        let number = Node::Number { value: declared.value, dimension: Some(unit.dimension), angle: unit.angle };
+        let (dimension, angle) = unit.as_ref().map_or((None, Angle::Silent), |unit| (Some(unit.dimension), unit.angle));
+        let number = Node::Number { value: declared.value, dimension, angle };
         let value = self.system.push(number, place);
         let var = self.add_var(Var {
             path: declared.path.clone(),
@@ -335,8 +336,8 @@ impl<'a> Flattener<'a> {
             span: place,
             instance: InstanceId(0),
             kind: VarKind::Param,
-            unit: Some((unit, place)),
-            unreadable: false,
+            unreadable: unit.is_none(),
+            unit: unit.map(|unit| (unit, place)),
             shown: None,
             range: VarRange::default(),
             range_span: None,

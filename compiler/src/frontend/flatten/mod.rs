@@ -68,8 +68,8 @@ pub struct Declared {
     pub name: Name,
     /// Its path in the system.
     pub path: String,
-    /// Its unit.
-    pub unit: Unit,
+    /// Its unit, if it is known.
+    pub unit: Option<Unit>,
     /// Its value in SI.
     pub value: f64,
 }
