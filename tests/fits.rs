@@ -677,7 +677,7 @@ fn what_stands_out_in_a_recording_is_said() {
         .map(|(_, line)| format!("{line}\n"))
         .collect();
     let (told, _) = said("gap", &text, &gap, &[]);
-    assert!(told.contains("W0905") && told.contains("has gap"), "{told}");
+    assert!(told.contains("W0905") && told.contains("has a gap"), "{told}");
     for seed in 0..10 {
         let (told, exit) = said("nothing", &text, &slide(seed, &|_, _| 0.0), &["--strict"]);
         assert_eq!((&told[..], exit), ("", 0), "seed {seed}");

@@ -384,11 +384,14 @@ pub fn remarks(part: &Part, answer: &Answer, items: std::ops::Range<usize>) -> V
             let (name, unit) = names[found.column].clone();
             (name, unit, found)
         });
-        Remarks {
-            depends,
-            outliers: statistics::outliers(residuals, &white),
-            begins_badly: !part.asks.steady && statistics::begins_badly(residuals),
-        }
+        let begins_badly = !part.asks.steady && statistics::begins_badly(residuals);
+        // A bad beginning is no outlier.
+        let is_beginning = |found: &Outliers| {
+            let head = residuals.len() / 10;
+            found.rows.iter().all(|row| *row < head) && found.tenth.as_ref().is_none_or(|tenth| tenth.start == 0)
+        };
+        let outliers = statistics::outliers(residuals, &white).filter(|found| !(begins_badly && is_beginning(found)));
+        Remarks { depends, outliers, begins_badly }
     };
     items.map(one).collect()
 }

@@ -205,7 +205,7 @@ impl Fitted {
             let of = if runs.parts.len() > 1 { format!(" of {}", part.asks.label) } else { String::new() };
             let gaps = if part.asks.steady { 0 } else { gaps(&part.asks.rows).len() };
             if gaps > 0 {
-                let what = if gaps == 1 { "gap".to_string() } else { format!("{} gaps", count(gaps as u64)) };
+                let what = if gaps == 1 { "a gap".to_string() } else { format!("{} gaps", count(gaps as u64)) };
                 let warning = Diagnostic::warning("W0905", format!("the recording{of} has {what}"))
                     .label(runs.name, "an interval between rows is longer than usual");
                 all.push((
