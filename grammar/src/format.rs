@@ -275,7 +275,7 @@ impl<'s, 't> Layout<'s, 't> {
     fn asks(&self, at: usize) -> bool {
         let word = self.source.word(at);
         self.source.kind(at) == Some(TokenKind::Word)
-            && (is_keyword(word) && !matches!(word, "next" | "reset")
+            && (is_keyword(word) && !matches!(word, "next" | "reset" | "initial")
                 || is_context_word(word) && (self.starts[at].is_some() || at > 0 && self.ends(at - 1)))
     }
 

@@ -192,3 +192,12 @@ fn trees_survive_and_twice_is_once() {
     }
     assert!(tried > rounds / 10, "{tried} of {rounds} can be read");
 }
+
+/// A case is a block in a fit; an initial value is written as a call.
+#[test]
+fn cases_of_fits_are_blocks() {
+    becomes(
+        "fit f {\nvary initial (z) in -1 um..1 um each,Fc in 1 N .. 2 N\ncase slow { run A(v=data.v) data \"a.csv\",\"b.csv\" (t [s], v [m/s])\nminimise rms(F) validate \"c.csv\" }\n}\n",
+        "fit f {\n  vary initial(z) in -1 um .. 1 um each, Fc in 1 N .. 2 N\n  case slow {\n    run      A(v = data.v)\n    data     \"a.csv\", \"b.csv\" (t [s], v [m/s])\n    minimise rms(F)\n    validate \"c.csv\"\n  }\n}\n",
+    );
+}

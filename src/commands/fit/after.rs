@@ -31,13 +31,16 @@ const FALSE_DRIFT: f64 = 1e-3;
 /// Values and standard deviations in one piece of the recordings; none where the piece does not determine them.
 pub type Piece = Vec<Option<(f64, f64)>>;
 
+/// Runs a model with values of all unknowns.
+type Whole<'a> = dyn FnMut(&[Vec<f64>]) -> Vec<Result<Residuals, String>> + 'a;
+
 /// Runs with some of the unknowns, the others as in `base`.
 fn restricted(
     runs: &Runs,
     base: &[f64],
     free: &[usize],
     settings: Settings,
-    run: &mut dyn FnMut(&[Vec<f64>]) -> Vec<Result<Residuals, String>>,
+    run: &mut Whole,
 ) -> Result<Answer, Trouble> {
     let (all, items): (Vec<Unknown>, Vec<Item>) = runs.asked(base);
     let place = |k: usize| free.iter().position(|other| *other == k);

@@ -418,13 +418,16 @@ impl Settings {
 /// An answer, the steps of its runs, and what is to be said of it.
 pub type Found = (Answer, Vec<f64>, Option<String>);
 
+/// Runs a model in some way with sets of values.
+pub(super) type Model<'a> = dyn FnMut(Way, &[Vec<f64>]) -> Vec<Residuals> + 'a;
+
 /// Estimates the unknowns from some rows.
 pub(super) fn estimate(
     runs: &Runs,
     unknowns: &[Unknown],
     items: &[Item],
     settings: Settings,
-    run: &mut dyn FnMut(Way, &[Vec<f64>]) -> Vec<Residuals>,
+    run: &mut Model,
 ) -> Result<Answer, Trouble> {
     let (exp, log) = (ElementaryFunction::exp(), ElementaryFunction::log());
     runtime::fit::fit(Question {
