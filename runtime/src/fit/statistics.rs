@@ -180,7 +180,7 @@ mod tests {
     }
 
     /// A residual that depends on one of three columns names it, with the share that it explains; one that depends on
-    /// none names none. With the test left out the second half fails in about a third of the seeds.
+    /// none names none.
     #[test]
     fn a_dependence_is_found_and_chance_is_not() {
         let mut false_alarms = 0;
@@ -211,7 +211,7 @@ mod tests {
         assert_eq!(all.iter().map(Vec::len).collect::<Vec<_>>(), [150, 50]);
     }
 
-    /// A burst is found where it is; a normal recording has none. Without the median, a long burst hides itself.
+    /// A burst is found where it is; a normal recording has none.
     #[test]
     fn bursts_are_found_where_they_are() {
         for seed in 0..100 {
