@@ -116,6 +116,8 @@ pub struct Recording {
     states: VecDeque<State>,
     /// Short runs, in the order of time, and where the data ended when the latest came.
     ahead: (VecDeque<Ahead>, u64),
+    /// The newest short run that is over, and how much the recording differs from it.
+    judged: (Option<u64>, Vec<Option<f64>>),
     /// Whether somebody makes short runs.
     running: bool,
     buses: Vec<Load>,
@@ -187,6 +189,7 @@ impl Recording {
             measured: (Vec::new(), false),
             states: VecDeque::new(),
             ahead: (VecDeque::new(), 0),
+            judged: (None, Vec::new()),
             running: false,
             buses: rig.buses.iter().map(|_| Load::default()).collect(),
         }
@@ -239,6 +242,7 @@ impl Recording {
             self.clamp(output, end, Clamps::default());
         }
         self.ends = Some(ends);
+        self.judge();
         self.tell();
     }
 
@@ -272,6 +276,7 @@ impl Recording {
         let Some(block) = words.get(2..2 + size).filter(|_| self.measured.1) else { return };
         let block = block.iter().map(|word| f64::from_bits(*word)).collect();
         let at = self.history.cycles().end.saturating_sub(1);
+        self.judge();
         if self.states.len() == AHEAD {
             self.states.pop_front();
         }
@@ -297,15 +302,20 @@ impl Recording {
             all.pop_front();
         }
         *from = self.history.cycles().end;
+        self.judge();
         self.tell();
     }
 
-    /// How much the recording differs from the newest short run that is over, for each recorded quantity.
-    fn rms_ahead(&self) -> Vec<Option<f64>> {
+    /// Computes how much the recording differs from the newest short run that is over, for each recorded quantity: once,
+    /// and not for each viewer.
+    fn judge(&mut self) {
         let end = self.history.cycles().end;
         let over = |one: &&Ahead| one.curves.first().is_some_and(|curve| one.at + (curve.len() as u64) < end);
-        let Some(last) = self.ahead.0.iter().rev().find(over) else { return Vec::new() };
-        (0..last.curves.len()).map(|curve| last.rms(curve, |cycle| self.history.value(curve, cycle))).collect()
+        let Some(last) = self.ahead.0.iter().rev().find(over) else { return };
+        if self.judged.0 != Some(last.at) {
+            let rms = |curve| last.rms(curve, |cycle| self.history.value(curve, cycle));
+            self.judged = (Some(last.at), (0..last.curves.len()).map(rms).collect());
+        }
     }
 
     /// Shows a dry run beside the recorded quantities.
@@ -594,7 +604,7 @@ impl Recording {
             "layers": [true, !self.twin.is_empty(), !self.ahead.0.is_empty()],
             "kept": [],
             "rms": self.differences.iter().map(Difference::rms).collect::<Vec<_>>(),
-            "ahead": self.rms_ahead(),
+            "ahead": self.judged.1,
             "standing": self.standing(),
             "words": clean(&words),
             "set": "",
