@@ -23,9 +23,9 @@ pub struct Args {
     pub command: Option<Command>,
 }
 
-/// The arguments of this process; ends it with a message if they are wrong, or if they ask for help.
-pub fn parse() -> Args {
-    Args::parse()
+/// The arguments, the name of the program first; ends the process with a message if they are wrong, or if they ask for help.
+pub fn parse(arguments: impl IntoIterator<Item = std::ffi::OsString>) -> Args {
+    Args::parse_from(arguments)
 }
 
 /// A script that completes the commands and options in a shell.

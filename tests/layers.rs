@@ -22,7 +22,7 @@ const CRATES: [(&str, &str, &[&str]); 7] = [
     ("runtime", "runtime/src/lib.rs", &["abi"]),
     ("panel", "panel/src/lib.rs", &["abi", "runtime"]),
     ("fric-rig", "rig/src/main.rs", &["abi", "runtime", "panel"]),
-    ("fric", "src/main.rs", &["grammar", "abi", "compiler", "runtime", "panel"]),
+    ("fric", "src/lib.rs", &["grammar", "abi", "compiler", "runtime", "panel"]),
 ];
 
 /// Where an outside crate may be named: files or folders. A crate used throughout one of ours has the source folder of

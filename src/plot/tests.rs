@@ -95,7 +95,7 @@ fn odd_figures_are_drawn_without_complaint() {
     png::png(&Figure::default(), &Look::default());
 }
 
-/// Writes a picture to look at: `FRIC_PICTURES=out cargo test --bin fric picture`.
+/// Writes a picture to look at: `FRIC_PICTURES=out cargo test --lib picture`.
 #[test]
 fn a_picture_has_letters_without_any_system_font() {
     let blank = png::png(&Figure { panels: vec![Panel::default()], ..Figure::default() }, &Look::default());

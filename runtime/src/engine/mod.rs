@@ -13,7 +13,7 @@ pub mod sweep;
 use crate::coupling::sil;
 use crate::record::{Recorder, Recording};
 use crate::run::fixed::Fixed;
-use crate::run::observe::{Observer, Probe};
+use crate::run::observe::{Observer, Probe, check_status};
 use crate::run::outcome::Stop;
 pub use crate::run::outcome::{Cause, Continue, Estimate, Failure, Final, Outcome, Work};
 use crate::run::stepper::{self, Rest, Stepper};
@@ -149,6 +149,11 @@ pub(crate) fn start(
         true => Ok(Box::new(Fixed::start(instance, experiment, observer, begin)?)),
         false => Ok(Box::new(Adaptive::start(instance, experiment, observer, begin)?)),
     }
+}
+
+/// Why a fixed step, after which the instance is as given, returned a status; none if this is 0.
+pub fn failure(instance: &Instance, status: u64) -> Option<Failure> {
+    check_status(instance, status).err().map(failed)
 }
 
 /// Converts a run that has ended to its outcome.

@@ -1,0 +1,350 @@
+//! What other programs embed of the command: texts with their experiments and models, without arguments and terminal.
+//!
+//! In: a text and its name. Out: runs with the results of `fric run --json`, programs of models, reports on mistakes as
+//! strings. Files that a text names are read once, so that the text can be sent elsewhere together with them.
+
+use crate::compile::{self, Built, Case, Changes, Loaded, Options, Sources, Stages};
+use crate::disk::Disk;
+use crate::figure::{self, Kept};
+use crate::plot::{self, Look};
+use crate::results::{self, Ran};
+use crate::{equations, project, report};
+use abi::unit::Unit;
+use grammar::diagnostic::Diagnostic;
+use runtime::engine::{self, Continue, Failure, Outcome, even_grid, sweep as runs};
+use runtime::record::Recording;
+use std::path::Path;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Instant;
+
+/// A file that a text names: the name of that text, the path as written there, the name and the text of the file.
+pub type NamedFile = (String, String, String, String);
+
+/// The sources of a text: files that are given or were read before, then the disk.
+#[derive(Clone, Default)]
+struct NamedFiles(Arc<Mutex<Vec<NamedFile>>>);
+
+impl NamedFiles {
+    fn all(&self) -> Vec<NamedFile> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+}
+
+impl Sources for NamedFiles {
+    fn library(&self, module: &str) -> Option<Vec<(String, String)>> {
+        Disk.library(module)
+    }
+
+    fn modules(&self) -> Vec<String> {
+        Disk.modules()
+    }
+
+    fn library_is_sound(&self) -> bool {
+        Disk.library_is_sound()
+    }
+
+    fn file(&self, from: &str, path: &str) -> Result<(String, String), String> {
+        let mut all = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some((_, _, name, text)) = all.iter().find(|file| file.0 == from && file.1 == path) {
+            return Ok((name.clone(), text.clone()));
+        }
+        let (name, text) = Disk.file(from, path)?;
+        all.push((from.into(), path.into(), name.clone(), text.clone()));
+        Ok((name, text))
+    }
+}
+
+/// What is wrong with a text or with what was asked of it.
+#[derive(Clone, Debug)]
+pub struct Problems {
+    /// The report as on a terminal without colour.
+    pub report: String,
+    /// The diagnostics as the JSON of `fric check --json`.
+    pub json: String,
+    /// The codes of the errors.
+    pub codes: Vec<&'static str>,
+}
+
+impl Problems {
+    fn of(loaded: &Loaded, found: &[Diagnostic]) -> Problems {
+        Problems {
+            report: report::full(&loaded.files.0, found, false),
+            json: report::json(&loaded.files.0, found).to_string(),
+            codes: found.iter().filter(|diagnostic| diagnostic.is_error()).map(|diagnostic| diagnostic.code).collect(),
+        }
+    }
+}
+
+/// One case of an experiment, after its run.
+pub struct Run {
+    /// The object of `fric run --json`.
+    pub json: String,
+    /// How the case differs from the others of its experiment.
+    pub label: String,
+    /// The message and the time in s of a failure.
+    pub failure: Option<(String, f64)>,
+    case: Case,
+    result: Result<Outcome, Failure>,
+}
+
+impl Run {
+    /// The rows that were recorded for plots: a few thousand, with each minimum and maximum.
+    pub fn thin(&self) -> &Recording {
+        match &self.result {
+            Ok(outcome) => &outcome.recording,
+            Err(failure) => &failure.recording,
+        }
+    }
+
+    /// Whether [`thin`](Run::thin) has every step of the run.
+    pub fn is_whole(&self) -> bool {
+        self.thin().rows().len() as u64 >= self.thin().seen()
+    }
+
+    /// Every step, by repeating the run.
+    ///
+    /// # Errors
+    /// If these are too many, with the remedy in words.
+    pub fn every_step(&self, watch: &mut dyn FnMut(f64) -> Continue) -> Result<Recording, String> {
+        let found = engine::every_step(self.case.instance.clone(), &self.case.experiment, watch).0;
+        found.ok_or_else(|| {
+            let width = self.thin().columns().len() + 1;
+            let most = engine::MOST_NUMBERS / width;
+            let seen = self.thin().seen();
+            format!("{seen} steps of {width} columns are too many, {most} steps are possible: ask for `every=\"1 ms\"`, or `thin=True` for as many rows as a plot needs")
+        })
+    }
+
+    /// Rows at equal distances in s, by repeating the run.
+    ///
+    /// # Errors
+    /// If these are too many or the distance is unusable, in words.
+    pub fn even(&self, every: f64, watch: &mut dyn FnMut(f64) -> Continue) -> Result<Recording, String> {
+        let grid = even_grid::instants(every, &self.case.experiment).map_err(|why| why.to_string())?;
+        Ok(even_grid::record(self.case.instance.clone(), &self.case.experiment, &grid, watch).0)
+    }
+
+    /// Rows at these instants in s, ascending, by repeating the run.
+    pub fn at(&self, instants: &[f64], watch: &mut dyn FnMut(f64) -> Continue) -> Recording {
+        even_grid::record(self.case.instance.clone(), &self.case.experiment, instants, watch).0
+    }
+
+    /// The distance of rows that the experiment asks for, in s.
+    pub fn every(&self) -> Option<f64> {
+        self.case.experiment.every
+    }
+
+    /// Final values: path, SI, unit, and whether it is a truth value.
+    pub fn finals(&self) -> Vec<(String, f64, String, bool)> {
+        let Ok(outcome) = &self.result else { return Vec::new() };
+        let all = outcome.finals.iter();
+        all.map(|end| (end.path.clone(), end.value, end.unit.text.clone(), end.boolean)).collect()
+    }
+
+    /// The plots of the experiment as SVG, `wide` px wide; empty if it has none. `id` makes its identifiers unique on a
+    /// page.
+    pub fn svg(&self, wide: f64, id: &str) -> String {
+        if self.case.experiment.plots.is_empty() {
+            return String::new();
+        }
+        let verdicts = self.result.as_ref().map_or(Vec::new(), |outcome| outcome.verdicts.clone());
+        let kept: [Kept; 1] = [(self.thin().clone(), verdicts)];
+        let subtitle =
+            format!("{}, {}", self.case.instance.description().name, results::solver(&self.case.experiment.solver));
+        let cases = std::slice::from_ref(&self.case);
+        let figure = figure::figure(&self.case.experiment.name, &subtitle, 0, &figure::recorded(cases, &kept));
+        plot::inline(&figure, &Look::default(), wide, id)
+    }
+}
+
+/// A text with the library and the files that it names.
+#[derive(Clone)]
+pub struct Text {
+    loaded: Loaded,
+    sources: NamedFiles,
+}
+
+impl Text {
+    /// Loads a text. `files`: those that it names, as [`files`](Text::files) has returned them elsewhere.
+    ///
+    /// # Errors
+    /// Mistakes of syntax and names.
+    pub fn new(name: &str, text: &str, files: Vec<NamedFile>) -> Result<Text, Problems> {
+        let sources = NamedFiles(Arc::new(Mutex::new(files)));
+        let loaded = compile::load(name, text, &sources);
+        if loaded.diagnostics.iter().any(Diagnostic::is_error) {
+            return Err(Problems::of(&loaded, &loaded.diagnostics));
+        }
+        Ok(Text { loaded, sources })
+    }
+
+    /// The text of a file.
+    ///
+    /// # Errors
+    /// Why it cannot be read, in words.
+    pub fn read(path: &Path) -> Result<String, String> {
+        project::read(path)
+    }
+
+    /// The name and the text itself.
+    pub fn source(&self) -> (String, String) {
+        let file = self.loaded.files.get(self.loaded.root());
+        (file.name.clone(), file.text.to_string())
+    }
+
+    /// The files that it names, as far as they have been read.
+    pub fn files(&self) -> Vec<NamedFile> {
+        self.sources.all()
+    }
+
+    /// Names of its models.
+    pub fn models(&self) -> Vec<String> {
+        self.loaded.models().iter().map(|model| model.name.text.clone()).collect()
+    }
+
+    /// Names of its experiments.
+    pub fn experiments(&self) -> Vec<String> {
+        self.loaded.experiments().into_iter().map(|experiment| experiment.name).collect()
+    }
+
+    /// What `fric check` says: errors and warnings.
+    pub fn check(&self) -> Problems {
+        let mut loaded = self.loaded.clone();
+        let found = compile::check(&mut loaded, &self.sources);
+        Problems::of(&loaded, &found)
+    }
+
+    /// The nearest of some names, for a message.
+    pub fn nearest<'a>(name: &str, all: &'a [String]) -> Option<&'a str> {
+        compile::nearest(name, all.iter().map(String::as_str))
+    }
+
+    /// Compiles and runs an experiment as `fric run` does: a run for each case of its sweeps. `errors`: also estimates the
+    /// numerical errors of its measures. `corners`: instants in s at which inputs have corners, beside those that the
+    /// experiment knows; adaptive runs meet them. `watch` receives the fraction done from several threads, and may stop the runs.
+    ///
+    /// # Errors
+    /// The errors of the models and of the experiment.
+    pub fn run(
+        &self,
+        experiment: &str,
+        options: &Options,
+        corners: &[f64],
+        errors: bool,
+        watch: &(dyn Fn(f64) -> Continue + Sync),
+    ) -> Result<Vec<Run>, Problems> {
+        let mut loaded = self.loaded.clone();
+        let found = compile::check_declarations(&loaded, &self.sources);
+        if found.iter().any(Diagnostic::is_error) {
+            return Err(Problems::of(&loaded, &found));
+        }
+        let cases = compile::compile(&mut loaded, &self.sources, experiment, options, &mut Vec::new(), &mut |_| ());
+        let mut cases = cases.map_err(|found| Problems::of(&loaded, &found))?;
+        for Case { experiment, .. } in &mut cases {
+            experiment.corners.extend(corners.iter().filter(|t| **t > 0.0 && **t < experiment.duration));
+            experiment.corners.sort_by(f64::total_cmp);
+            experiment.corners.dedup();
+        }
+        let all: Vec<runs::Case> = cases
+            .iter()
+            .map(|case| runs::Case {
+                label: case.label.clone(),
+                instance: case.instance.clone(),
+                experiment: case.experiment.clone(),
+            })
+            .collect();
+        let begin = Instant::now();
+        let mut results = runs::run(&all, watch);
+        let wall = begin.elapsed().as_secs_f64();
+        if errors {
+            runs::judge(&all, &mut results, watch);
+        }
+        let (file, stages) = (self.source().0, Stages::default());
+        let run = |(case, result): (Case, Result<Outcome, Failure>)| {
+            let ran = Ran {
+                file: &file,
+                experiment: &case.experiment,
+                label: &case.label,
+                instance: &case.instance,
+                notes: &case.notes,
+                result: &result,
+                wall,
+                stages: &stages,
+            };
+            let json = ran.json().to_string();
+            let failure = result.as_ref().err().map(|failure| (failure.to_string(), failure.time));
+            Run { json, label: case.label.clone(), failure, case, result }
+        };
+        Ok(cases.into_iter().zip(results).map(run).collect())
+    }
+
+    /// A model on its own with its inputs open.
+    ///
+    /// # Errors
+    /// All errors of the model, and of the changes.
+    pub fn built(&self, model: &str, changes: &Changes) -> Result<Built, Problems> {
+        let mut loaded = self.loaded.clone();
+        let built = compile::build(&mut loaded, &self.sources, model, changes, &mut Vec::new());
+        built.map_err(|found| Problems::of(&loaded, &found))
+    }
+
+    /// The quantities of an experiment: path and SI unit.
+    ///
+    /// # Errors
+    /// All errors of the experiment.
+    pub fn units(&self, experiment: &str) -> Result<Vec<(String, String)>, Problems> {
+        let mut loaded = self.loaded.clone();
+        let found = compile::quantities(&mut loaded, &self.sources, experiment, &Changes::default());
+        let all = found.map_err(|found| Problems::of(&loaded, &found))?;
+        let si = |text: &str| unit(text).map_or(String::new(), |unit| Unit::si(unit.dimension).text);
+        Ok(all.into_iter().map(|quantity| (quantity.path, si(&quantity.unit))).collect())
+    }
+
+    /// The text with further lines at the end of a model.
+    pub fn extended(&self, model: &str, lines: &str) -> Option<String> {
+        let all = self.loaded.models();
+        let span = all.iter().find(|one| one.name.text == model)?.span.range();
+        let text = self.source().1;
+        let end = text[..span.end].rfind('}').filter(|end| *end > span.start)?;
+        Some(format!("{}\n{lines}\n{}", &text[..end], &text[end..]))
+    }
+
+    /// The equations of a model in the symbols of print, a line each; empty if the text has no such model.
+    pub fn equations(&self, model: &str) -> String {
+        let all = self.loaded.models();
+        let found = all.iter().find(|one| one.name.text == model);
+        found.map_or(String::new(), |model| equations::lines(&equations::equations(model)))
+    }
+}
+
+/// The file of the library that declares a model: its name and its text.
+pub fn library_model(name: &str) -> Option<(String, String)> {
+    let is_it = |line: &str| {
+        let rest = line.strip_prefix("model ").map_or("", str::trim_start);
+        rest.strip_prefix(name).is_some_and(|rest| !rest.starts_with(|c: char| c.is_alphanumeric() || c == '_'))
+    };
+    let found = project::library().iter().find(|(_, text)| text.lines().any(is_it));
+    found.map(|(file, text)| (format!("{file}.fric"), text.to_string()))
+}
+
+/// Names of all models of the library.
+pub fn library_models() -> Vec<String> {
+    crate::repl::library_models().iter().map(|name| name.to_string()).collect()
+}
+
+/// The value in SI of a text such as `2 N`, and the SI unit.
+///
+/// # Errors
+/// What is wrong with it, in words.
+pub fn quantity(text: &str) -> Result<(f64, String), String> {
+    let (value, unit) = crate::quantity::parse(text)?;
+    Ok((value, Unit::si(unit.dimension).text))
+}
+
+/// A unit by its text.
+///
+/// # Errors
+/// If there is no such unit, in words.
+pub fn unit(text: &str) -> Result<Unit, String> {
+    if text.is_empty() { Ok(Unit::none()) } else { Unit::parse(text) }
+}
