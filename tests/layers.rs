@@ -15,7 +15,7 @@ fn root() -> PathBuf {
 }
 
 /// Our crates with their sources, and those of our crates that each may use.
-const CRATES: [(&str, &str, &[&str]); 7] = [
+const CRATES: [(&str, &str, &[&str]); 8] = [
     ("grammar", "grammar/src/lib.rs", &[]),
     ("abi", "abi/src/lib.rs", &[]),
     ("compiler", "compiler/src/lib.rs", &["grammar", "abi"]),
@@ -23,6 +23,7 @@ const CRATES: [(&str, &str, &[&str]); 7] = [
     ("panel", "panel/src/lib.rs", &["abi", "runtime"]),
     ("fric-rig", "rig/src/main.rs", &["abi", "runtime", "panel"]),
     ("fric", "src/lib.rs", &["grammar", "abi", "compiler", "runtime", "panel"]),
+    ("fric-python", "python/src/lib.rs", &["abi", "compiler", "runtime", "fric"]),
 ];
 
 /// Where an outside crate may be named: files or folders. A crate used throughout one of ours has the source folder of
@@ -54,10 +55,12 @@ const HOMES: &[(&str, &[&str])] = &[
     ("minisign-verify", &["runtime/src/package/signature.rs"]),
     ("miniz_oxide", &["src/matrices.rs", "runtime/src/record/packed.rs"]),
     ("nalgebra", &["runtime/src/coupling/"]),
+    ("numpy", &["python/src/"]),
     ("parquet", &["src/parquet.rs"]),
     ("pdf-writer", &["src/plot/pdf.rs"]),
     ("pest", &["grammar/src/parse.rs"]),
     ("pest_derive", &["grammar/src/parse.rs"]),
+    ("pyo3", &["python/src/"]),
     ("rayon", &["runtime/src/engine/sweep.rs"]),
     ("resvg", &["src/plot/png.rs", "src/plot/pdf.rs"]),
     ("rtrb", &["runtime/src/spsc.rs"]),

@@ -183,8 +183,8 @@ fn either<'a>(a: Option<Truth<'a>>, b: Option<Truth<'a>>) -> Option<Truth<'a>> {
     }
 }
 
-/// A range widened by its tolerance.
-fn widened((low, high): (f64, f64)) -> (f64, f64) {
+/// A range widened by the tolerance of guards.
+pub fn widened((low, high): (f64, f64)) -> (f64, f64) {
     let tolerance = match (low.is_finite(), high.is_finite()) {
         (true, true) => 1e-6 * (high - low),
         (true, false) => 1e-6 * low.abs(),

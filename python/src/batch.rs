@@ -1,0 +1,594 @@
+//! Many instances of one model, stepped together in lanes and by several threads, with the bits of single ones.
+
+use crate::arrays;
+use crate::raise;
+use crate::stepper::{Plan, Started, names_of};
+use crate::watched::guarded;
+use abi::description::{Guard, Kind};
+use abi::lanes::Lanes;
+use abi::{Description, Instance, Slot};
+use compiler::codegen::tiering;
+use compiler::numerics::fixed_step::widened;
+use numpy::PyArrayMethods;
+use pyo3::exceptions::{PyTypeError, PyValueError};
+use pyo3::prelude::*;
+use runtime::engine;
+use std::sync::Arc;
+
+/// Rows of a tile: what is transposed at once, so that it stays in the nearest cache.
+const TILE: usize = 64;
+
+/// Instances that are stepped together.
+enum Group {
+    /// In the lanes of vectors; those beyond the number of instances repeat the last one.
+    Lanes(Box<abi::lanes::Batch>),
+    /// One by one, where there is no such code.
+    Alone(Vec<Instance>),
+}
+
+/// Why an instance stopped: its status, and its block then.
+type Stopped = Option<(u64, Vec<f64>)>;
+
+/// Many running instances of a model.
+#[pyclass(module = "fric._fric")]
+pub struct Batch {
+    plan: Arc<Plan>,
+    template: Instance,
+    width: usize,
+    len: usize,
+    threads: usize,
+    groups: Vec<Group>,
+    stopped: Vec<Stopped>,
+    /// Started blocks and ranges, one for each set of parameters, and the set of each instance.
+    blocks: Vec<Vec<f64>>,
+    guards: Vec<Vec<Guard>>,
+    starts: Vec<u32>,
+    /// Guards whose range depends on the set: the code watches a range that holds for all.
+    varied: Vec<usize>,
+}
+
+/// What a worker needs besides its groups.
+#[derive(Clone, Copy)]
+struct Job<'a> {
+    inputs: &'a [Slot],
+    outputs: &'a [Slot],
+    pool: &'a [f64],
+    /// Of the rows of inputs: numbers from one instance to the next, and from one row to the next; 0: held.
+    per_instance: usize,
+    per_row: usize,
+    rows: usize,
+    /// A row of outputs after so many steps.
+    every: usize,
+    template: &'a Instance,
+    watched: &'a [Watched],
+}
+
+/// A guard whose range the code does not watch.
+struct Watched {
+    /// Its number, from 0.
+    number: usize,
+    slot: Slot,
+    /// Its range in each set of parameters.
+    ranges: Vec<(f64, f64)>,
+}
+
+/// The arrays of a group: its own part of inputs, outputs and reasons to stop.
+struct Part<'a> {
+    group: &'a mut Group,
+    stopped: &'a mut [Stopped],
+    /// The set of parameters of each instance.
+    starts: &'a [u32],
+    given: &'a [f64],
+    taken: &'a mut [f64],
+}
+
+impl Job<'_> {
+    fn go(&self, part: Part) {
+        match part.group {
+            Group::Lanes(batch) => self.in_lanes(batch, part.stopped, part.starts, part.given, part.taken),
+            Group::Alone(instances) => self.alone(instances, part.stopped, part.starts, part.given, part.taken),
+        }
+    }
+
+    /// Numbers of outputs of an instance.
+    fn size(&self) -> usize {
+        self.rows / self.every * self.outputs.len()
+    }
+
+    /// The first guard beside those of the code that does not hold: its number. `value`: the value of the k-th of them.
+    fn violated(&self, set: u32, value: impl Fn(usize) -> f64) -> Option<usize> {
+        let mut watched = self.watched.iter().enumerate();
+        let outside = |(k, guard): (usize, &Watched)| {
+            let (low, high) = guard.ranges[set as usize];
+            (!(low..=high).contains(&value(k))).then_some(guard.number)
+        };
+        watched.find_map(outside)
+    }
+
+    fn in_lanes(
+        &self,
+        batch: &mut abi::lanes::Batch,
+        stopped: &mut [Stopped],
+        starts: &[u32],
+        given: &[f64],
+        taken: &mut [f64],
+    ) {
+        let (width, n, m) = (batch.width(), self.inputs.len(), self.outputs.len());
+        let all: Vec<Slot> = self.outputs.iter().copied().chain(self.watched.iter().map(|guard| guard.slot)).collect();
+        let wide = all.len();
+        // Lanes beyond the instances, and those that have stopped, move with numbers that are sound.
+        let used = stopped.len();
+        let mut into = vec![0.0; TILE * n * width];
+        let mut out = vec![0.0; TILE * wide * width];
+        for begin in (0..self.rows).step_by(TILE) {
+            let rows = TILE.min(self.rows - begin);
+            for lane in 0..width {
+                let of = &given[lane.min(used - 1) * self.per_instance..];
+                for row in 0..rows {
+                    let from = &of[(begin + row) * self.per_row..][..n];
+                    from.iter().enumerate().for_each(|(k, x)| into[(row * n + k) * width + lane] = *x);
+                }
+            }
+            let (from, to) = ((self.inputs, &into[..rows * n * width]), (&all[..], &mut out[..rows * wide * width]));
+            // The row in this tile from which on an instance has no results.
+            let mut ends: Vec<usize> = stopped.iter().map(|stop| if stop.is_some() { 0 } else { rows }).collect();
+            let runs: Vec<bool> = stopped.iter().map(Option::is_none).collect();
+            let mut again = vec![false; width];
+            batch.follow(self.pool, from, to, rows, &mut |row, batch| {
+                for lane in (0..width).filter(|lane| batch.status(*lane) != 0) {
+                    again[lane] = true;
+                    if let Some(stop) = stopped.get_mut(lane).filter(|stop| stop.is_none()) {
+                        let mut block = self.template.block().to_vec();
+                        batch.save(lane, &mut block);
+                        *stop = Some((batch.status(lane), block));
+                        ends[lane] = row;
+                    }
+                }
+            });
+            for lane in (0..runs.len()).filter(|lane| runs[*lane] && !self.watched.is_empty()) {
+                let value = |row: usize, k: usize| out[(row * wide + k) * width + lane];
+                let first = |row: usize| Some((row, self.violated(starts[lane], |k| value(row, m + k))?));
+                if let Some((row, guard)) = (0..ends[lane]).find_map(first) {
+                    let mut block = self.template.block().to_vec();
+                    batch.save(lane, &mut block);
+                    // As it was after that step, as far as it is known.
+                    block[Slot::COUNT.index()] -= (rows - row - 1) as f64;
+                    all.iter().enumerate().for_each(|(k, slot)| block[slot.index()] = value(row, k));
+                    (stopped[lane], ends[lane], again[lane]) = (Some((guard as u64 + 1, block)), row, true);
+                }
+            }
+            for lane in (0..width).filter(|lane| again[*lane]) {
+                batch.load(lane, self.template.block());
+            }
+            for (lane, end) in ends.iter().enumerate() {
+                for row in (0..rows).filter(|row| (begin + row + 1).is_multiple_of(self.every)) {
+                    let to = &mut taken[lane * self.size() + (begin + row) / self.every * m..][..m];
+                    for (k, x) in to.iter_mut().enumerate() {
+                        *x = if row < *end { out[(row * wide + k) * width + lane] } else { f64::NAN };
+                    }
+                }
+            }
+        }
+    }
+
+    fn alone(
+        &self,
+        instances: &mut [Instance],
+        stopped: &mut [Stopped],
+        starts: &[u32],
+        given: &[f64],
+        taken: &mut [f64],
+    ) {
+        let m = self.outputs.len();
+        for (i, (instance, stop)) in instances.iter_mut().zip(stopped).enumerate() {
+            for row in 0..self.rows {
+                if stop.is_none() {
+                    let from = &given[i * self.per_instance + row * self.per_row..];
+                    self.inputs.iter().zip(from).for_each(|(slot, x)| instance.set(*slot, *x));
+                    let mut status = instance.advance(1);
+                    if status == 0 {
+                        let violated = self.violated(starts[i], |k| instance.get(self.watched[k].slot));
+                        status = violated.map_or(0, |guard| guard as u64 + 1);
+                    }
+                    if status != 0 {
+                        *stop = Some((status, instance.block().to_vec()));
+                    }
+                }
+                if (row + 1).is_multiple_of(self.every) {
+                    let to = &mut taken[i * self.size() + row / self.every * m..][..m];
+                    to.iter_mut().zip(self.outputs).for_each(|(x, slot)| {
+                        *x = if stop.is_none() { instance.get(*slot) } else { f64::NAN };
+                    });
+                }
+            }
+        }
+    }
+}
+
+/// Guards with ranges that hold for all sets, and the numbers of those that differ.
+fn common(guards: &[Vec<Guard>]) -> (Vec<Guard>, Vec<usize>) {
+    let mut common = guards[0].clone();
+    let mut varied = Vec::new();
+    for (k, guard) in common.iter_mut().enumerate() {
+        if guards.iter().any(|own| own[k].range != guard.range) {
+            let all = guards.iter().map(|own| own[k].range);
+            guard.range =
+                all.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), own| (low.min(own.0), high.max(own.1)));
+            varied.push(k);
+        }
+    }
+    (common, varied)
+}
+
+#[pymethods]
+impl Batch {
+    /// Starts instances at time 0. `sets`: different sets of parameters; `which`: that of each instance.
+    #[new]
+    #[allow(clippy::too_many_arguments, reason = "the Python files name each of them")]
+    fn new(
+        py: Python,
+        text: Py<crate::text::Text>,
+        model: &str,
+        sets: Vec<std::collections::BTreeMap<String, String>>,
+        which: Vec<usize>,
+        solver: &str,
+        step: f64,
+        inputs: Option<Vec<String>>,
+        outputs: Option<Vec<String>>,
+        threads: usize,
+        interpret: bool,
+    ) -> PyResult<Batch> {
+        let len = which.len();
+        if len == 0 || which.iter().any(|set| *set >= sets.len()) || threads == 0 {
+            return Err(PyValueError::new_err("a batch has at least one instance and one thread"));
+        }
+        let how = (solver, step, interpret);
+        let first = Started::new(py, text, model, &sets[0], how, inputs, outputs)?;
+        first.checked(py)?;
+        let mut blocks = vec![first.instance.block().to_vec()];
+        let mut guards = vec![first.program.description.guards.clone()];
+        for set in &sets[1..] {
+            let other = Started::again(py, &first.plan, set)?;
+            if let Some(what) = first.difference(&other) {
+                let message = format!("these parameters change {what}, not only numbers: make a batch for each value");
+                return Err(raise::range(py, &message));
+            }
+            other.checked(py)?;
+            blocks.push(other.instance.block().to_vec());
+            guards.push(other.program.description.guards.clone());
+        }
+        let (common, varied) = common(&guards);
+        let (program, template) = first.guarded_by(&common);
+        let lanes: Option<Lanes> = match interpret {
+            true => None,
+            false => guarded(py, || py.detach(|| tiering::lanes(&program, first.plan.method)))?,
+        };
+        let width = lanes.as_ref().map_or(8, Lanes::width);
+        let group = |which: &[usize]| match &lanes {
+            Some(lanes) => {
+                let mut batch = abi::lanes::Batch::new(lanes.clone());
+                for lane in 0..width {
+                    batch.load(lane, &blocks[which[lane.min(which.len() - 1)]]);
+                }
+                Group::Lanes(Box::new(batch))
+            }
+            None => Group::Alone(
+                which
+                    .iter()
+                    .map(|set| {
+                        let mut instance = template.clone();
+                        instance.block_mut().copy_from_slice(&blocks[*set]);
+                        instance
+                    })
+                    .collect(),
+            ),
+        };
+        let groups = which.chunks(width).map(group).collect();
+        let starts = which.iter().map(|set| *set as u32).collect();
+        let stopped = (0..len).map(|_| None).collect();
+        Ok(Batch { plan: first.plan, template, width, len, threads, groups, stopped, blocks, guards, starts, varied })
+    }
+
+    /// A step of each instance with its row of inputs; returns a row of outputs for each.
+    #[pyo3(signature = (inputs=None, out=None))]
+    fn step<'py>(
+        &mut self,
+        py: Python<'py>,
+        inputs: Option<Bound<'py, PyAny>>,
+        out: Option<Bound<'py, PyAny>>,
+    ) -> PyResult<Bound<'py, PyAny>> {
+        self.hold(py, 1, inputs, out)
+    }
+
+    /// Steps of each instance under held inputs; returns the last outputs.
+    #[pyo3(signature = (count, inputs=None, out=None))]
+    fn hold<'py>(
+        &mut self,
+        py: Python<'py>,
+        count: usize,
+        inputs: Option<Bound<'py, PyAny>>,
+        out: Option<Bound<'py, PyAny>>,
+    ) -> PyResult<Bound<'py, PyAny>> {
+        if count == 0 {
+            return Err(PyValueError::new_err("count: at least one step is made"));
+        }
+        let n = self.plan.inputs.len();
+        let given = self.given(inputs, &[self.len, n])?;
+        let columns = self.columns(&[self.len]);
+        self.go(py, given, (n, 0), (count, count), columns, out)
+    }
+
+    /// A step of each instance for each of its rows of inputs, of shape (instances, rows, inputs); returns outputs after
+    /// every so many of them.
+    #[pyo3(signature = (rows, every=1, out=None))]
+    fn follow<'py>(
+        &mut self,
+        py: Python<'py>,
+        rows: &Bound<'py, PyAny>,
+        every: usize,
+        out: Option<Bound<'py, PyAny>>,
+    ) -> PyResult<Bound<'py, PyAny>> {
+        let n = self.plan.inputs.len();
+        if n == 0 {
+            return Err(PyTypeError::new_err(format!("`{}` has no input to follow: use hold(count)", self.plan.model)));
+        }
+        let (array, shape) = arrays::doubles(rows, "rows")?;
+        let count = match shape[..] {
+            [len, count] if n == 1 && len == self.len => count,
+            [len, count, columns] if len == self.len && columns == n => count,
+            _ => {
+                return Err(PyValueError::new_err(format!(
+                    "rows: an array of shape {shape:?} was given, and ({}, rows, {n}) is needed",
+                    self.len
+                )));
+            }
+        };
+        if every == 0 || count % every != 0 {
+            return Err(PyValueError::new_err(format!("every: {every} does not divide {count} rows")));
+        }
+        let columns = self.columns(&[self.len, count / every]);
+        self.go(py, Some(array), (count * n, n), (count, every), columns, out)
+    }
+
+    fn __len__(&self) -> usize {
+        self.len
+    }
+
+    /// Which instances have stopped.
+    #[getter]
+    fn failed<'py>(&self, py: Python<'py>) -> Bound<'py, numpy::PyArray1<bool>> {
+        numpy::PyArray1::from_iter(py, self.stopped.iter().map(Option::is_some))
+    }
+
+    /// Why an instance has stopped; none if it has not.
+    fn why(&self, index: usize) -> PyResult<Option<String>> {
+        let stopped = self.stopped.get(index);
+        let stopped =
+            stopped.ok_or_else(|| pyo3::exceptions::PyIndexError::new_err(format!("{index} of {}", self.len)))?;
+        let Some((status, block)) = stopped else { return Ok(None) };
+        let guards = self.guards[self.starts[index] as usize].clone();
+        let description = Description { guards, ..Description::clone(self.template.description()) };
+        let code = abi::Code::Interpreted(Arc::new(compiler::ir::interpret::Interpreter::default()));
+        let params = description.layout.params.range();
+        let mut instance = Instance::new(Arc::new(description), code, &block[params]);
+        instance.block_mut().copy_from_slice(block);
+        instance.set(Slot::TIME, instance.get(Slot::COUNT) * instance.get(Slot::STEP));
+        Ok(engine::failure(&instance, *status).map(|failure| failure.to_string()))
+    }
+
+    /// Names of the states, in the order of the columns of `state`.
+    #[getter]
+    fn states(&self) -> Vec<String> {
+        self.state_slots().into_iter().map(|(path, _)| path).collect()
+    }
+
+    /// The states, a copy of shape (instances, states).
+    #[getter]
+    fn get_state<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
+        let states = self.state_slots();
+        let mut numbers = Vec::with_capacity(self.len * states.len());
+        for index in 0..self.len {
+            numbers.extend(states.iter().map(|(_, slot)| self.get(index, *slot)));
+        }
+        arrays::array(py, numbers, Some(&[self.len, states.len()]))
+    }
+
+    #[setter]
+    fn set_state(&mut self, value: &Bound<PyAny>) -> PyResult<()> {
+        let states = self.state_slots();
+        let (array, shape) = arrays::doubles(value, "state")?;
+        if shape != [self.len, states.len()] {
+            let needed = (self.len, states.len());
+            return Err(PyValueError::new_err(format!("state: shape {shape:?} was given, and {needed:?} is needed")));
+        }
+        let numbers = array.to_vec().map_err(|error| PyValueError::new_err(error.to_string()))?;
+        for (index, row) in numbers.chunks_exact(states.len().max(1)).enumerate() {
+            states.iter().zip(row).for_each(|((_, slot), x)| self.set(index, *slot, *x));
+        }
+        Ok(())
+    }
+
+    /// A quantity of all instances.
+    fn __getitem__<'py>(&self, py: Python<'py>, path: &str) -> PyResult<Bound<'py, PyAny>> {
+        let all = &self.template.description().quantities;
+        let slot = crate::stepper::slots(py, "quantity", vec![path.into()], all, |q| q.kind != Kind::Regime)?[0].1;
+        arrays::array(py, (0..self.len).map(|index| self.get(index, slot)).collect(), None)
+    }
+
+    /// Starts instances anew at time 0: all, or those where the mask is true.
+    #[pyo3(signature = (mask=None))]
+    fn reset(&mut self, mask: Option<Bound<PyAny>>) -> PyResult<()> {
+        let mask: Vec<bool> = match mask {
+            None => vec![true; self.len],
+            Some(mask) => mask.call_method0("tolist").unwrap_or(mask).extract()?,
+        };
+        if mask.len() != self.len {
+            return Err(PyValueError::new_err(format!("mask: {} values for {} instances", mask.len(), self.len)));
+        }
+        for index in (0..self.len).filter(|index| mask[*index]) {
+            let block = &self.blocks[self.starts[index] as usize];
+            match &mut self.groups[index / self.width] {
+                Group::Lanes(batch) => batch.load(index % self.width, block),
+                Group::Alone(instances) => instances[index % self.width].block_mut().copy_from_slice(block),
+            }
+            self.stopped[index] = None;
+        }
+        Ok(())
+    }
+
+    /// Names of the columns of inputs.
+    #[getter]
+    fn inputs(&self) -> Vec<&str> {
+        names_of(&self.plan.inputs)
+    }
+
+    /// Names of the columns of outputs.
+    #[getter]
+    fn outputs(&self) -> Vec<&str> {
+        names_of(&self.plan.outputs)
+    }
+
+    fn __repr__(&self) -> String {
+        let (n, m) = (names_of(&self.plan.inputs).join(", "), names_of(&self.plan.outputs).join(", "));
+        let threads = if self.threads > 1 { format!(", {} threads", self.threads) } else { String::new() };
+        format!("<fric.Batch of {} {}: ({n}) -> ({m}){threads}>", self.len, self.plan.model)
+    }
+}
+
+impl Batch {
+    /// Inputs of this shape; without its last dimension if there is one input.
+    fn given<'py>(
+        &self,
+        inputs: Option<Bound<'py, PyAny>>,
+        shape: &[usize],
+    ) -> PyResult<Option<Bound<'py, numpy::PyArrayDyn<f64>>>> {
+        let n = self.plan.inputs.len();
+        let Some(inputs) = inputs else {
+            return match n {
+                0 => Ok(None),
+                _ => Err(PyTypeError::new_err(format!("inputs: an array of shape {shape:?} is needed"))),
+            };
+        };
+        let (array, given) = arrays::doubles(&inputs, "inputs")?;
+        let fits = given == shape || n == 1 && given == shape[..shape.len() - 1];
+        if !fits {
+            return Err(PyValueError::new_err(format!("inputs: shape {given:?} was given, and {shape:?} is needed")));
+        }
+        Ok(Some(array))
+    }
+
+    /// The shape of results.
+    fn columns(&self, before: &[usize]) -> Vec<usize> {
+        let m = self.plan.outputs.len();
+        before.iter().copied().chain((m > 1).then_some(m)).collect()
+    }
+
+    /// Makes steps. `per`: numbers of inputs from one instance to the next, and from one row to the next.
+    fn go<'py>(
+        &mut self,
+        py: Python<'py>,
+        given: Option<Bound<'py, numpy::PyArrayDyn<f64>>>,
+        per: (usize, usize),
+        (rows, every): (usize, usize),
+        shape: Vec<usize>,
+        out: Option<Bound<'py, PyAny>>,
+    ) -> PyResult<Bound<'py, PyAny>> {
+        let inputs: Vec<Slot> = self.plan.inputs.iter().map(|(_, slot)| *slot).collect();
+        let outputs: Vec<Slot> = self.plan.outputs.iter().map(|(_, slot)| *slot).collect();
+        let read = given.as_ref().map(|given| given.readonly());
+        let given = match &read {
+            Some(read) => read.as_slice().map_err(|error| PyValueError::new_err(error.to_string()))?,
+            None => &[],
+        };
+        let target = out.as_ref().map(|out| arrays::target(out, &shape)).transpose()?;
+        let mut write = match &target {
+            Some(target) => {
+                Some(target.try_readwrite().map_err(|error| PyValueError::new_err(format!("out: {error}")))?)
+            }
+            None => None,
+        };
+        let mut own = if write.is_none() { vec![0.0; shape.iter().product()] } else { Vec::new() };
+        let taken = match &mut write {
+            Some(write) => write.as_slice_mut().map_err(|error| PyValueError::new_err(format!("out: {error}")))?,
+            None => &mut own[..],
+        };
+        let description = self.template.description().clone();
+        let watched: Vec<Watched> = self
+            .varied
+            .iter()
+            .map(|k| Watched {
+                number: *k,
+                slot: self.guards[0][*k].slot,
+                ranges: self.guards.iter().map(|own| widened(own[*k].range)).collect(),
+            })
+            .collect();
+        let job = Job {
+            inputs: &inputs,
+            outputs: &outputs,
+            pool: &description.pool,
+            per_instance: per.0,
+            per_row: per.1,
+            rows,
+            every,
+            template: &self.template,
+            watched: &watched,
+        };
+        let starts = &self.starts;
+        let (width, size, threads) = (self.width, job.size(), self.threads.min(self.groups.len()));
+        let groups = self.groups.iter_mut().zip(self.stopped.chunks_mut(width));
+        let parts = groups.zip(taken.chunks_mut((width * size).max(1))).enumerate();
+        let parts: Vec<Part> = parts
+            .map(|(k, ((group, stopped), taken))| {
+                let end = ((k * width + stopped.len()) * per.0).min(given.len());
+                let starts = &starts[k * width..][..stopped.len()];
+                Part { group, stopped, starts, given: &given[(k * width * per.0).min(end)..end], taken }
+            })
+            .collect();
+        let work = || match threads {
+            0 | 1 => parts.into_iter().for_each(|part| job.go(part)),
+            _ => {
+                let queue = std::sync::Mutex::new(parts.into_iter());
+                let next = || queue.lock().unwrap_or_else(std::sync::PoisonError::into_inner).next();
+                std::thread::scope(|scope| {
+                    for _ in 0..threads {
+                        scope.spawn(|| {
+                            while let Some(part) = next() {
+                                job.go(part);
+                            }
+                        });
+                    }
+                });
+            }
+        };
+        guarded(py, || py.detach(work))?;
+        drop(write);
+        match out {
+            Some(out) => Ok(out),
+            None => arrays::array(py, own, Some(&shape)),
+        }
+    }
+
+    fn state_slots(&self) -> Vec<(String, Slot)> {
+        let all = self.template.description().quantities.iter();
+        let states = all.filter(|quantity| matches!(quantity.kind, Kind::State | Kind::SampledState));
+        states.map(|quantity| (quantity.path.clone(), quantity.slot)).collect()
+    }
+
+    /// A slot of an instance; of one that has stopped, as it was then.
+    fn get(&self, index: usize, slot: Slot) -> f64 {
+        if let Some((_, block)) = &self.stopped[index] {
+            return block[slot.index()];
+        }
+        match &self.groups[index / self.width] {
+            Group::Lanes(batch) => batch.get(slot, index % self.width),
+            Group::Alone(instances) => instances[index % self.width].get(slot),
+        }
+    }
+
+    fn set(&mut self, index: usize, slot: Slot, value: f64) {
+        match &mut self.groups[index / self.width] {
+            Group::Lanes(batch) => batch.set(slot, index % self.width, value),
+            Group::Alone(instances) => instances[index % self.width].set(slot, value),
+        }
+    }
+}

@@ -1,0 +1,86 @@
+//! The extension module of the Python package `fric`: texts, runs and running instances.
+//!
+//! In: calls of the Python files in `fric/`, which know units, pandas and notebooks. Out: arrays, numbers, and
+//! exceptions of `fric.errors`. The only home of PyO3 and NumPy. Work longer than some microseconds lets other threads
+//! run, and a run ends soon after Ctrl-C.
+
+mod raise;
+mod arrays;
+mod watched;
+mod text;
+mod stepper;
+mod batch;
+
+use abi::unit::Unit;
+use pyo3::exceptions::PyValueError;
+use pyo3::prelude::*;
+
+/// A unit by its text.
+fn unit(text: &str) -> PyResult<Unit> {
+    fric::embed::unit(text).map_err(PyValueError::new_err)
+}
+
+/// The module.
+#[pymodule(gil_used = false)]
+mod _fric {
+    use crate::arrays;
+    #[pymodule_export]
+    use crate::batch::Batch;
+    #[pymodule_export]
+    use crate::stepper::Stepper;
+    #[pymodule_export]
+    use crate::text::{Run, Text};
+    use abi::unit::Unit;
+    use numpy::PyArrayMethods;
+    use pyo3::exceptions::PyValueError;
+    use pyo3::prelude::*;
+
+    /// Runs the command with these arguments, the name of the program first; returns the exit code.
+    #[pyfunction]
+    fn command(py: Python, arguments: Vec<std::ffi::OsString>) -> u8 {
+        py.detach(|| fric::main_with(arguments))
+    }
+
+    /// The text of the library file that declares a model.
+    #[pyfunction]
+    fn library_model(name: &str) -> Option<(String, String)> {
+        fric::embed::library_model(name)
+    }
+
+    /// Names of all models of the library.
+    #[pyfunction]
+    fn library_models() -> Vec<String> {
+        fric::embed::library_models()
+    }
+
+    /// The name nearest to another.
+    #[pyfunction]
+    fn nearest(name: &str, all: Vec<String>) -> Option<String> {
+        fric::embed::Text::nearest(name, &all).map(str::to_string)
+    }
+
+    /// Value in SI and unit of a text such as `2 N`; raises ValueError.
+    #[pyfunction]
+    fn quantity(text: &str) -> PyResult<(f64, String)> {
+        fric::embed::quantity(text).map_err(PyValueError::new_err)
+    }
+
+    /// The SI unit of a unit; raises ValueError.
+    #[pyfunction]
+    fn si_unit(unit: &str) -> PyResult<String> {
+        Ok(Unit::si(crate::unit(unit)?.dimension).text)
+    }
+
+    /// Values in SI as numbers in a unit.
+    #[pyfunction]
+    fn in_unit<'py>(values: Bound<'py, PyAny>, unit: &str) -> PyResult<Bound<'py, PyAny>> {
+        let (array, unit) = (arrays::doubles(&values, "values")?.0, crate::unit(unit)?);
+        let numbers = array.to_vec().map_err(|error| PyValueError::new_err(error.to_string()))?;
+        arrays::array(values.py(), numbers.into_iter().map(|x| unit.from_si(x)).collect(), None)
+    }
+
+    #[pymodule_init]
+    fn init(module: &Bound<'_, PyModule>) -> PyResult<()> {
+        module.add("__version__", env!("CARGO_PKG_VERSION"))
+    }
+}

@@ -1,0 +1,92 @@
+//! Work that lets other threads run, and that Ctrl-C ends.
+
+use crate::raise;
+use pyo3::prelude::*;
+use runtime::engine::Continue;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::mpsc::{RecvTimeoutError, channel};
+use std::time::Duration;
+
+/// Pause between two looks for signals.
+const LOOK: Duration = Duration::from_millis(20);
+
+/// What a worker reports and asks.
+pub struct Progress {
+    stop: AtomicBool,
+    /// The fraction done, as bits.
+    done: AtomicU64,
+}
+
+impl Progress {
+    /// Reports the fraction done, and whether to go on.
+    pub fn report(&self, fraction: f64) -> Continue {
+        self.done.store(fraction.to_bits(), Ordering::Relaxed);
+        if self.stop.load(Ordering::Relaxed) { Continue::Break(()) } else { Continue::Continue(()) }
+    }
+}
+
+/// Does work in a thread of its own, while this one looks for signals and calls `progress` with the fraction done. An
+/// exception of either stops the work and is returned.
+pub fn watched<T: Send>(
+    py: Python,
+    progress: Option<&Bound<PyAny>>,
+    work: impl FnOnce(&Progress) -> T + Send,
+) -> PyResult<T> {
+    let state = Progress { stop: AtomicBool::new(false), done: AtomicU64::new(0f64.to_bits()) };
+    let progress = progress.map(|progress| progress.clone().unbind());
+    let (mut raised, mut result) = (None, None);
+    py.detach(|| {
+        std::thread::scope(|scope| {
+            let (to, from) = channel();
+            let shared = &state;
+            // Errors of steps are values; a deep text needs a deep stack.
+            let worker = std::thread::Builder::new().stack_size(16 << 20).spawn_scoped(scope, move || {
+                let _ = to.send(catch_unwind(AssertUnwindSafe(|| work(shared))));
+            });
+            if let Err(error) = worker {
+                result = Some(Err(format!("no thread can be had: {error}")));
+                return;
+            }
+            loop {
+                match from.recv_timeout(LOOK) {
+                    Ok(done) => {
+                        result = Some(done.map_err(|why| words(&*why)));
+                        return;
+                    }
+                    Err(RecvTimeoutError::Disconnected) => return,
+                    Err(RecvTimeoutError::Timeout) => {}
+                }
+                if raised.is_some() {
+                    continue;
+                }
+                let looked = Python::attach(|py| {
+                    py.check_signals()?;
+                    let done = f64::from_bits(state.done.load(Ordering::Relaxed));
+                    progress.as_ref().map_or(Ok(()), |call| call.call1(py, (done, 1.0)).map(|_| ()))
+                });
+                if let Err(error) = looked {
+                    raised = Some(error);
+                    state.stop.store(true, Ordering::Relaxed);
+                }
+            }
+        });
+    });
+    match (raised, result) {
+        (Some(error), _) => Err(error),
+        (None, Some(Ok(done))) => Ok(done),
+        (None, Some(Err(message))) => Err(raise::internal(py, &message)),
+        (None, None) => Err(raise::internal(py, "a thread ended without a result")),
+    }
+}
+
+/// Does work without letting a panic through.
+pub fn guarded<T>(py: Python, work: impl FnOnce() -> T) -> PyResult<T> {
+    catch_unwind(AssertUnwindSafe(work)).map_err(|why| raise::internal(py, &words(&*why)))
+}
+
+/// The message of a panic.
+fn words(why: &(dyn std::any::Any + Send)) -> String {
+    let text = why.downcast_ref::<String>().cloned();
+    text.or_else(|| why.downcast_ref::<&str>().map(|text| text.to_string())).unwrap_or_else(|| "a panic".into())
+}
