@@ -80,7 +80,7 @@ mod tests {
 
     /// Every point inside is in its row, to the bit, and nothing else is; times rise.
     ///
-    /// Mutants tried: `from..to`; a row for each curve; negative times in the order of their bits.
+    /// Mutants tried: a row at either end left out; negative times in the order of their bits.
     #[test]
     fn the_rows_are_the_points_between_the_cursors() {
         for seed in 1..=500_u64 {

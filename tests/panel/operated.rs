@@ -565,8 +565,6 @@ fn one_page_operates_and_others_watch() {
 /// Random sets of several pages, some of which are old, in disorder, or of pages that do not operate; the chair goes from
 /// one to another meanwhile. Each set that is answered with a cycle is in the log in that cycle, no other one is there, and
 /// the log replays to the bit. `FRIC_SEED` repeats one.
-///
-/// Mutants tried: the answer names the cycle after; a set that is answered before the cycle has judged it.
 #[test]
 fn the_log_has_each_set_of_many_pages_at_the_cycle_that_is_answered() {
     let seed = std::env::var("FRIC_SEED")

@@ -55,8 +55,7 @@ fn a_recording_is_looked_through() {
     for wanted in [extremes.0, extremes.1, rows.last().unwrap().1] {
         assert!(words.iter().any(|word| (word - wanted).abs() <= 1e-3 * wanted.abs().max(1e-6)), "{wanted} in {told}");
     }
-    // The model, anew from each full state, is near the rig; alone from arming on it is further away. Mutants tried: the
-    // plant at its own start; the state of the second before; the readings of the next cycle.
+    // The model, anew from each full state, is near the rig; alone from arming on it is further away.
     page.wait("!document.getElementById('free').hidden");
     let differs = |page: &Page| -> f64 {
         let told = page.text(
