@@ -1478,6 +1478,8 @@ mod tests {
     }
 
     /// Every command of the documents is one that this program takes.
+    ///
+    /// Mutant tried by hand: `--over` has another name.
     #[test]
     fn commands_in_the_documents_are_read() {
         let root = std::path::Path::new(env!("CARGO_MANIFEST_DIR"));

@@ -330,6 +330,8 @@ mod tests {
 
     /// A closed curve over one period, whose rows do not lie on the ends of the window: it has its whole period, and it
     /// closes. The rows are those of a polygon, so that the points on its edges are exact.
+    ///
+    /// Mutant tried by hand: only rows within the window are points.
     #[test]
     fn a_window_begins_and_ends_on_its_edges() {
         let seed = std::env::var("FRIC_SEED").ok().and_then(|seed| seed.parse().ok()).unwrap_or(6);

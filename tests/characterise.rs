@@ -150,6 +150,8 @@ fn elements_with_yield_surfaces_are_characterised() {
 
 /// What `check`, `explain`, `characterise` and its LaTeX say of dissipation agree. LuGre with its stored energy is passive
 /// for σ2 ≥ σ1 (Fs − Fc)/Fc and not otherwise (Barahanov, Ortega 2000); without a `storage` nothing is proved.
+///
+/// Mutant tried by hand: what is not proved counts as shown.
 #[test]
 fn all_commands_agree_on_dissipation() {
     let folder = folder("dissipation");
@@ -201,6 +203,8 @@ fn all_commands_agree_on_dissipation() {
 }
 
 /// A family over an input; the report of one lists what was held.
+///
+/// Mutant tried by hand: each member has its own bench.
 #[test]
 fn a_family_goes_over_an_input() {
     let folder = folder("family");

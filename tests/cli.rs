@@ -1098,6 +1098,8 @@ fn effect(folder: &Folder, args: &[&str]) -> Effect {
 
 /// Every option changes what comes out, or is refused by its name with exit code 2, or is told to be without effect:
 /// for each kind of experiment, alone and with others.
+///
+/// Mutants tried by hand: `--step` of an adaptive run is not refused; looks without a figure are not.
 #[test]
 fn every_option_has_an_effect_or_a_word() {
     let folder = Folder::new("options");
@@ -1164,6 +1166,8 @@ fn every_option_has_an_effect_or_a_word() {
 }
 
 /// Rows of a joint sweep, of shares of values, and of models in a slot are those of runs that set the same values.
+///
+/// Mutant tried by hand: a share of several quantities is taken as the number itself.
 #[test]
 fn joint_and_relative_sweeps_are_runs_with_these_values() {
     let folder = Folder::new("joint").with("k.fric", KINDS);
@@ -1201,6 +1205,8 @@ fn joint_and_relative_sweeps_are_runs_with_these_values() {
 }
 
 /// A label names every quantity that a sweep changes together, and so do the files.
+///
+/// Mutant tried by hand: the label has the first path alone.
 #[test]
 fn a_joint_sweep_names_all_its_quantities() {
     let text = KINDS
@@ -1213,6 +1219,8 @@ fn a_joint_sweep_names_all_its_quantities() {
 }
 
 /// What a user's file declares hides what the library has; two files of the user do not hide each other.
+///
+/// Mutant tried by hand: files and library have one rank (E0202).
 #[test]
 fn an_imported_file_hides_the_library() {
     let model = |force: &str| format!("model Controller {{ input e [m] output u [N] = {force} * e }}\n");
@@ -1229,6 +1237,8 @@ fn an_imported_file_hides_the_library() {
 }
 
 /// A run that leaves a range only because its fixed steps are too long says so; one that leaves it anyway does not.
+///
+/// Mutant tried by hand: the comparison with adaptive steps is negated.
 #[test]
 fn a_step_that_is_too_long_is_named() {
     let text = "model Relaxes {\n  input u [m]\n  param T = 1 ms in > 0\n  state x [m] = -1 m in -1 m .. 1 m\n  dx/dt = (u - x) / T\n}\n\

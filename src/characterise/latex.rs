@@ -444,6 +444,8 @@ mod tests {
 
     /// Every unit of the language, alone and in products, quotients and powers, is upright wherever a text with it can
     /// stand: in a formula, as a value of a table, in a label. Nothing of it is left among the letters of formulas.
+    ///
+    /// Mutant tried by hand: a number is read without its unit.
     #[test]
     fn every_unit_is_upright_everywhere() {
         let seed = std::env::var("FRIC_SEED").ok().and_then(|seed| seed.parse().ok()).unwrap_or(4);
