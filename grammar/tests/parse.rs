@@ -274,7 +274,7 @@ fn common_slips_get_an_answer_to_paste() {
     );
     model_says(
         "let a = if k > 0 1 else 2",
-        &["E0001 `if k > 0` `if` needs a `then` (`then` is missing after this) | write `if c then a else b`"],
+        &["E0001 `if k > 0` `if` needs a `then` (`then` is missing after this) | write `if k > 0 then a else b`"],
     );
     model_says("require k = 2", &["E0001 `=` a comparison is written `==` (`=` defines) | write `k == 2`"]);
     model_says(
