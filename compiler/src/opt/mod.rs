@@ -5,11 +5,11 @@
 //! rounded, so all of these passes run before every back end: the back ends then agree to the bit. Passes that need
 //! control flow or depend on the processor are in `codegen`.
 
+mod twins;
 pub mod reassociate;
 pub mod contract;
 pub mod limiter_tests;
 pub mod guard_reduction;
-mod twins;
 
 use crate::ir::Func;
 use crate::ir::program::Program;
