@@ -76,7 +76,7 @@ impl Problems {
 }
 
 /// One case of an experiment, after its run.
-pub struct Run {
+pub struct EndedRun {
     /// The object of `fric run --json`.
     pub json: String,
     /// How the case differs from the others of its experiment.
@@ -87,7 +87,7 @@ pub struct Run {
     result: Result<Outcome, Failure>,
 }
 
-impl Run {
+impl EndedRun {
     /// The rows that were recorded for plots: a few thousand, with each minimum and maximum.
     pub fn thin(&self) -> &Recording {
         match &self.result {
@@ -96,7 +96,7 @@ impl Run {
         }
     }
 
-    /// Whether [`thin`](Run::thin) has every step of the run.
+    /// Whether [`thin`](EndedRun::thin) has every step of the run.
     pub fn is_whole(&self) -> bool {
         self.thin().rows().len() as u64 >= self.thin().seen()
     }
@@ -232,7 +232,7 @@ impl Text {
         corners: &[f64],
         errors: bool,
         watch: &(dyn Fn(f64) -> Continue + Sync),
-    ) -> Result<Vec<Run>, Problems> {
+    ) -> Result<Vec<EndedRun>, Problems> {
         let mut loaded = self.loaded.clone();
         let found = compile::check_declarations(&loaded, &self.sources);
         if found.iter().any(Diagnostic::is_error) {
@@ -273,7 +273,7 @@ impl Text {
             };
             let json = ran.json().to_string();
             let failure = result.as_ref().err().map(|failure| (failure.to_string(), failure.time));
-            Run { json, label: case.label.clone(), failure, case, result }
+            EndedRun { json, label: case.label.clone(), failure, case, result }
         };
         Ok(cases.into_iter().zip(results).map(run).collect())
     }

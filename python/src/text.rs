@@ -156,7 +156,7 @@ pub fn method(py: Python, name: &str) -> PyResult<Method> {
 /// A case of an experiment, after its run.
 #[pyclass(frozen, module = "fric._fric")]
 pub struct Run {
-    run: embed::Run,
+    run: embed::EndedRun,
 }
 
 /// Label, unit, whether it is a truth value, and the values in SI.
