@@ -784,7 +784,7 @@ impl<'t> Reader<'t> {
         for piece in self.source.statements(place, block) {
             let word = self.source.word(piece.start);
             let elsewhere = match place {
-                Place::Experiment => matches!(word, "vary" | "minimise" | "validate"),
+                Place::Experiment => matches!(word, "vary" | "minimise" | "validate" | "case"),
                 Place::Case => matches!(word, "vary" | "case"),
                 _ => false,
             };
@@ -795,7 +795,7 @@ impl<'t> Reader<'t> {
                 );
                 continue;
             }
-            if place == Place::Fit && word == "case" && self.source.block(piece).is_some() {
+            if place == Place::Fit && word == "case" {
                 body.extend(self.fit_case(piece).map(FitStatement::Case));
                 continue;
             }
@@ -879,7 +879,13 @@ impl<'t> Reader<'t> {
 
     /// A case of a fit.
     fn fit_case(&mut self, piece: Piece) -> Option<FitCase> {
-        let (open, inside) = self.source.block(piece)?;
+        let Some((open, inside)) = self.source.block(piece) else {
+            if self.read(Rule::one_run, piece).is_some() {
+                let span = self.source.span(piece.end - 1);
+                self.report(Diagnostic::error("E0001", "expected `{` here").label(span, "after this"));
+            }
+            return None;
+        };
         let head = self.read(Rule::one_run, Piece { start: piece.start, end: open });
         // Its statements are read even if its head is unreadable, to report the errors in them.
         let name = head.map(|head| self.name(Children::of(head).one()));
