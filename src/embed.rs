@@ -9,6 +9,7 @@ use crate::figure::{self, Kept};
 use crate::plot::{self, Look};
 use crate::results::{self, Ran};
 use crate::{equations, project, report};
+use abi::plan::Method;
 use abi::unit::Unit;
 use grammar::diagnostic::Diagnostic;
 use runtime::engine::{self, Continue, Failure, Outcome, even_grid, sweep as runs};
@@ -72,6 +73,23 @@ impl Problems {
             json: report::json(&loaded.files.0, found).to_string(),
             codes: found.iter().filter(|diagnostic| diagnostic.is_error()).map(|diagnostic| diagnostic.code).collect(),
         }
+    }
+}
+
+/// Why a step or a tolerance would be without effect on an experiment that is run by this method.
+fn without_effect(experiment: &str, method: Method, changes: &Changes) -> Option<String> {
+    match method {
+        Method::Adaptive if changes.step.is_some() => Some(format!(
+            "a step is for fixed steps, and `{experiment}` is run by adaptive ones: name a solver as well, one of {}, or leave \
+             the step out",
+            Method::list(Method::fixed())
+        )),
+        fixed if fixed != Method::Adaptive && changes.tol.is_some() => Some(format!(
+            "a tolerance is for adaptive steps, and `{experiment}` takes fixed ones of `{}`: name the solver `adaptive`, or leave \
+             the tolerance out",
+            fixed.name()
+        )),
+        _ => None,
     }
 }
 
@@ -224,7 +242,7 @@ impl Text {
     /// experiment knows; adaptive runs meet them. `watch` receives the fraction done from several threads, and may stop the runs.
     ///
     /// # Errors
-    /// The errors of the models and of the experiment.
+    /// The errors of the models and of the experiment; a step or a tolerance without effect.
     pub fn run(
         &self,
         experiment: &str,
@@ -240,6 +258,10 @@ impl Text {
         }
         let cases = compile::compile(&mut loaded, &self.sources, experiment, options, &mut Vec::new(), &mut |_| ());
         let mut cases = cases.map_err(|found| Problems::of(&loaded, &found))?;
+        let method = cases.first().map(|case| case.experiment.solver.method);
+        if let Some(why) = method.and_then(|method| without_effect(experiment, method, &options.changes)) {
+            return Err(Problems { report: why, ..Problems::of(&loaded, &[]) });
+        }
         for Case { experiment, .. } in &mut cases {
             experiment.corners.extend(corners.iter().filter(|t| **t > 0.0 && **t < experiment.duration));
             experiment.corners.sort_by(f64::total_cmp);

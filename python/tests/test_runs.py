@@ -35,6 +35,17 @@ def test_a_run_is_that_of_the_command(command, root, monkeypatch):
     assert [timeless(changed.json)] == same
 
 
+def test_a_step_or_a_tolerance_has_an_effect_or_is_refused():
+    text = fric.load(STICK_SLIP)
+    for solver in [None, "adaptive", "euler", "rk4", "expo", "implicit"]:
+        fixed = solver not in (None, "adaptive")
+        wrong = {"tol": 1e-5} if fixed else {"step": "1 ms"}
+        with pytest.raises(ValueError, match=r"tolerance is for|step is for"):
+            text.run("stick_slip", solver=solver, duration="1 s", errors=False, **wrong)
+        right = {"step": "10 us"} if fixed else {"tol": 1e-5}
+        assert text.run("stick_slip", solver=solver, duration="10 ms", errors=False, **right).steps > 0
+
+
 def test_rows_are_those_of_the_data(command, root, tmp_path):
     text = fric.load(root / STICK_SLIP)
     run = text.run("stick_slip")
