@@ -21,6 +21,18 @@ fn of_environment(name: &str, otherwise: u64) -> u64 {
     std::env::var(name).ok().and_then(|value| value.parse().ok()).unwrap_or(otherwise)
 }
 
+/// A driven oscillator as a part of a model.
+const OSCILLATOR: &str = "model Inner {
+  param p = 0.7
+  state x = 0.2
+  state y = 1
+  dx/dt = y / 1 s
+  dy/dt = (-x - 0.1 * y + p * sin(t / 1 s)) / 1 s
+  output both = x * y + p
+}
+model Whole { part m = Inner() }
+";
+
 /// A smooth dimensionless expression over the states x and y, the time and a parameter.
 fn expression(random: &mut Random, depth: u32) -> String {
     if depth == 0 {
@@ -62,16 +74,7 @@ fn what_is_recorded_does_not_depend_on_what_is_measured() {
         let f = expression(&mut random, 1 + case as u32 % 3);
         let text = |measure: &str| {
             format!(
-                "model Inner {{
-  param p = 0.7
-  state x = 0.2
-  state y = 1
-  dx/dt = y / 1 s
-  dy/dt = (-x - 0.1 * y + p * sin(t / 1 s)) / 1 s
-  output both = x * y + p
-}}
-model Whole {{ part m = Inner() }}
-experiment e {{
+                "{OSCILLATOR}experiment e {{
   run Whole() for 20 s
   plot m.x, {f}
   {measure}
@@ -114,16 +117,7 @@ fn a_slope_adds_up_to_the_difference() {
     while compared < runs {
         let f = expression(&mut random, 1 + compared as u32 % 3);
         let text = format!(
-            "model Inner {{
-  param p = 0.7
-  state x = 0.2
-  state y = 1
-  dx/dt = y / 1 s
-  dy/dt = (-x - 0.1 * y + p * sin(t / 1 s)) / 1 s
-  output both = x * y + p
-}}
-model Whole {{ part m = Inner() }}
-experiment e {{
+            "{OSCILLATOR}experiment e {{
   run Whole() for 3 s
   solver adaptive tol 1e-9
   expect integral(slope({f})) == 0
