@@ -3,7 +3,7 @@
 //! Help, completions and the man page are made from it. Values with units are read here, so that a wrong one is wrong
 //! usage and not a failed run.
 
-use crate::compile::{Changes, Emit};
+use crate::compile::{self, Changes, Emit, Idle};
 use crate::plot::{self, Figure, Lines};
 use crate::quantity;
 use crate::vary::{self, Vary};
@@ -183,21 +183,19 @@ fn without_effect(
     method: Method,
     (given, step, tol): (Option<Method>, Option<f64>, Option<f64>),
 ) -> Option<String> {
-    match (method, given) {
-        (Method::Adaptive, Some(_)) if step.is_some() => {
+    match (compile::idle(method, step, tol)?, given) {
+        (Idle::Step, Some(_)) => {
             Some("--step is for fixed steps, and `--solver adaptive` chooses its own: leave one of them out".into())
         }
-        (Method::Adaptive, None) if step.is_some() => Some(format!(
+        (Idle::Step, None) => Some(format!(
             "--step is for fixed steps, and `{name}` is run by adaptive ones: add `--solver expo`, which is exact for \
              bristles and filters, or another of {}; or leave it out",
             Method::list(Method::fixed())
         )),
-        (Method::Adaptive, _) => None,
-        (fixed, _) if tol.is_some() => Some(format!(
+        (Idle::Tolerance, _) => Some(format!(
             "--tol is for adaptive steps, and `{name}` takes fixed ones of `{}`: add `--solver adaptive`, or leave it out",
-            fixed.name()
+            method.name()
         )),
-        _ => None,
     }
 }
 

@@ -38,7 +38,35 @@ pub use compiler::{
     quantities, rig, stepping, varying,
 };
 use grammar::diagnostic::Diagnostic;
+use runtime::engine::sweep;
 use std::time::Instant;
+
+/// What has no effect on a run by some method.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub enum Idle {
+    /// A step: adaptive runs choose their own.
+    Step,
+    /// A tolerance: fixed steps have none.
+    Tolerance,
+}
+
+/// Which of these that are given has no effect on a run by this method.
+pub fn idle(method: Method, step: Option<f64>, tol: Option<f64>) -> Option<Idle> {
+    match method {
+        Method::Adaptive => step.map(|_| Idle::Step),
+        _ => tol.map(|_| Idle::Tolerance),
+    }
+}
+
+/// The cases as the engine runs them.
+pub fn runs_of(cases: &[Case]) -> Vec<sweep::Case> {
+    let one = |Case { label, instance, experiment, .. }: &Case| sweep::Case {
+        label: label.clone(),
+        instance: instance.clone(),
+        experiment: experiment.clone(),
+    };
+    cases.iter().map(one).collect()
+}
 
 /// What `fric build` makes of a model.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, clap::ValueEnum)]

@@ -3,7 +3,7 @@
 //! In: a text and its name. Out: runs with the results of `fric run --json`, programs of models, reports on mistakes as
 //! strings. Files that a text names are read once, so that the text can be sent elsewhere together with them.
 
-use crate::compile::{self, Built, Case, Changes, Loaded, Options, Sources, Stages};
+use crate::compile::{self, Built, Case, Changes, Idle, Loaded, Options, Sources, Stages};
 use crate::disk::Disk;
 use crate::figure::{self, Kept};
 use crate::plot::{self, Look};
@@ -78,18 +78,17 @@ impl Problems {
 
 /// Why a step or a tolerance would be without effect on an experiment that is run by this method.
 fn without_effect(experiment: &str, method: Method, changes: &Changes) -> Option<String> {
-    match method {
-        Method::Adaptive if changes.step.is_some() => Some(format!(
+    match compile::idle(method, changes.step, changes.tol)? {
+        Idle::Step => Some(format!(
             "a step is for fixed steps, and `{experiment}` is run by adaptive ones: name a solver as well, one of {}, or leave \
              the step out",
             Method::list(Method::fixed())
         )),
-        fixed if fixed != Method::Adaptive && changes.tol.is_some() => Some(format!(
+        Idle::Tolerance => Some(format!(
             "a tolerance is for adaptive steps, and `{experiment}` takes fixed ones of `{}`: name the solver `adaptive`, or leave \
              the tolerance out",
-            fixed.name()
+            method.name()
         )),
-        _ => None,
     }
 }
 
@@ -267,14 +266,7 @@ impl Text {
             experiment.corners.sort_by(f64::total_cmp);
             experiment.corners.dedup();
         }
-        let all: Vec<runs::Case> = cases
-            .iter()
-            .map(|case| runs::Case {
-                label: case.label.clone(),
-                instance: case.instance.clone(),
-                experiment: case.experiment.clone(),
-            })
-            .collect();
+        let all = compile::runs_of(&cases);
         let begin = Instant::now();
         let mut results = runs::run(&all, watch);
         let wall = begin.elapsed().as_secs_f64();

@@ -307,14 +307,7 @@ fn done_beside<T: Send>(
         }
         Continue::Continue(())
     };
-    let all: Vec<runs::Case> = cases
-        .iter()
-        .map(|case| runs::Case {
-            label: case.label.clone(),
-            instance: case.instance.clone(),
-            experiment: case.experiment.clone(),
-        })
-        .collect();
+    let all = compile::runs_of(&cases);
     let mut results = runs::run(&all, &watch);
     let wall = begin.elapsed().as_secs_f64();
     // The estimate needs no recording.
