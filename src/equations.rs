@@ -30,7 +30,7 @@ pub fn equations(model: &Model) -> Vec<(String, String)> {
             }
             Statement::Every(every) => sampled(every, &mut lines),
             Statement::Mode(mode) => {
-                // Regimes with the same equations are told together, where the first of them stands.
+                // Regimes with the same equations are one group, where the first of them stands.
                 let same = together(model, mode);
                 if same.first().is_none_or(|first| !std::ptr::eq(*first, mode)) {
                     continue;

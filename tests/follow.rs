@@ -24,7 +24,7 @@ use compiler::{Changes, Loaded, Sources};
 use std::sync::Arc;
 use support::{Texts, number};
 
-/// What was met, so that a property which tests nothing shows.
+/// How often each situation occurred: the test fails if one never did, because it then proves nothing.
 #[derive(Debug, Default)]
 struct Seen {
     programs: u64,

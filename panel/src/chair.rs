@@ -151,7 +151,7 @@ mod tests {
                     |page: u64, heard: &[Option<u64>]| heard[page as usize].is_none_or(|then| at - then > 5000);
                 let what = below(7);
                 if what != 6 && before == Some(page) {
-                    // Whoever speaks is there, however long it was silent before.
+                    // A page that sends something is there, however long it was silent before.
                     heard[page as usize] = Some(at);
                 }
                 if before.is_none_or(|holder| silent(holder, &heard)) {
@@ -237,7 +237,7 @@ mod tests {
         chair.take(2, at(1000)).unwrap();
         assert!(!chair.heard(3, at(5990)) && chair.heard(3, at(6000)));
         assert_eq!(chair.holder(), Some(2));
-        // It goes, and whoever asks need not wait.
+        // The operating page closes: the page that asks need not wait.
         chair.take(1, at(6100)).unwrap();
         chair.left(2, at(6200));
         assert_eq!(chair.holder(), Some(1));

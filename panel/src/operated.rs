@@ -44,7 +44,7 @@ const OLD: f64 = 1.0;
 const OPEN: usize = 64;
 /// Answers that are shown, the newest: each page picks its own ones.
 const ANSWERS: usize = 32;
-/// Least interval at which the rig is told that it is seen.
+/// Least interval of the messages to the rig that a page is drawn, which hold its dead man.
 const SEEN: Duration = Duration::from_millis(100);
 
 /// Time for which the panel of a rig that has ended waits for a page.

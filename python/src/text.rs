@@ -19,7 +19,7 @@ pub struct Text {
     text: embed::Text,
 }
 
-/// What `Text.describe` tells of a quantity: kind, path, unit, SI unit, range in SI, value in SI, whether it is a truth
+/// What `Text.describe` returns for a quantity: kind, path, unit, SI unit, range in SI, value in SI, whether it is a truth
 /// value, documentation.
 type Described = (&'static str, String, String, String, (f64, f64), Option<f64>, bool, Option<String>);
 

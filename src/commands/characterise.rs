@@ -483,7 +483,7 @@ mod tests {
     /// L = ln((1 + α)/(1 − α)): 2 Fc²/σ (L − 2α), 1/α − 2/L. Of elements with a virgin curve f(x) (Masing): 8 ∫f dx −
     /// 4 X a, where f(X) = a. Of one element below its yield: 0. Of LuGre, moved slowly: as Dahl with Fs.
     ///
-    /// Mutant tried by hand: the path is measured from its first turn to half of the amplitude, and so is open.
+    /// Mutant tried by hand: the loop is taken from its first turn to half of the amplitude, so it does not close.
     #[test]
     #[allow(clippy::disallowed_methods, reason = "tolerances are far above the last bits")]
     fn presliding_loops_lose_what_their_laws_say() {

@@ -310,7 +310,7 @@ fn too_long(loaded: &mut Loaded, name: &str, options: &Options, case: &Case, fai
         looks += 1;
         if looks > MOST_LOOKS { Continue::Break(()) } else { Continue::Continue(()) }
     };
-    // An adaptive run looks at ranges where its own steps end, which may be much later.
+    // An adaptive run tests ranges at the ends of its steps, which may lie long after a value has left one.
     let passed = match engine::run(other.instance, &other.experiment, &mut watch) {
         Ok(_) => true,
         Err(other) => other.time > 2.0 * failure.time,

@@ -538,7 +538,7 @@ fn one_page_operates_and_others_watch() {
     press(&one, "Take over");
     chair(&one, "you operate");
     assert!(begun.elapsed() > Duration::from_secs(4), "{:?}", begun.elapsed());
-    // Whoever goes leaves it.
+    // A page that closes leaves the chair.
     drop(one);
     two.wait("document.getElementById('chair').hidden");
     two.again(&|| set(&two, &own("2.75")), &happened("2.75"));

@@ -243,7 +243,7 @@ fn the_page_of_a_rig_is_for_everybody() {
     for (role, least) in [("button", 10), ("slider", 8), ("textbox", 8), ("combobox", 4), ("meter", 2)] {
         assert!(roles.iter().filter(|one| *one == role).count() >= least, "{role}: {roles:?}");
     }
-    // Whoever cannot see is told how it stands, and of faults at once.
+    // A screen reader hears the state of the rig, and faults at once.
     assert_eq!(
         page.value(
             "['sentence', 'problem', 'chair', 'taken'].map(id => document.getElementById(id).getAttribute('role'))"

@@ -19,7 +19,7 @@ const TRIALS: u32 = 100;
 const PART_OF_NOISE: f64 = 0.1;
 /// How often a step is halved at most.
 const MOST_HALVINGS: u32 = 8;
-/// Tolerance of runs that are held to their recording, which follow its noise.
+/// Relative tolerance of runs that an observer holds to their recording. They follow its noise, so a smaller one gains nothing.
 const HELD_TOL: f64 = 1e-5;
 
 /// The compiled fit and its rows.
@@ -346,8 +346,8 @@ impl Runs {
     }
 }
 
-/// Calls a function with shares of a list, each in a thread and a multiple of `width` long, and joins its results. Each
-/// run has the same bits wherever it is run.
+/// Divides a list among threads, calls a function with each share, and joins the results in order. Shares are multiples
+/// of `width`, so that lanes are full. The bits of a run do not depend on its share.
 fn shared<A: Send, B: Send>(
     mut all: Vec<A>,
     threads: usize,
