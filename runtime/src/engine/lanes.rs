@@ -34,12 +34,10 @@ struct Series<'r> {
 }
 
 impl Series<'_> {
-    /// Writes the values of one lane after a step to a block.
-    fn read(&self, step: u64, lane: usize, block: &mut [f64]) {
-        let first = step as usize * self.slots.len();
-        for (k, slot) in self.slots.iter().enumerate() {
-            block[slot.index()] = self.rows[(first + k) * self.width + lane];
-        }
+    /// Writes the values of a slot in one lane after each of the first steps.
+    fn read(&self, slot: usize, lane: usize, column: &mut [f64]) {
+        let values = self.rows[slot * self.width + lane..].iter().step_by(self.slots.len() * self.width);
+        column.iter_mut().zip(values).for_each(|(to, value)| *to = *value);
     }
 }
 
@@ -229,7 +227,7 @@ impl<T> Lane<T> {
         // holds the other slots of the step too.
         if let Some((slots, _)) = self.course.series() {
             assert_eq!(slots, series.slots, "all runs in lanes read the same slots");
-            if let Err(stop) = self.course.show(done - 1, &|step, block| series.read(step, number, block)) {
+            if let Err(stop) = self.course.show(done - 1, &|slot, column| series.read(slot, number, column)) {
                 return Some(Err(stop));
             }
         }

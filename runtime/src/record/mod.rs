@@ -10,6 +10,7 @@ mod packed;
 pub mod parts;
 pub mod log;
 
+use crate::run::stretch::Stretch;
 use abi::Slot;
 use abi::plan::{Plot, Series};
 use abi::unit::Unit;
@@ -159,11 +160,30 @@ impl Recorder {
         if self.slots.is_empty() {
             return;
         }
-        self.last[0] = self.seen as f64;
-        self.last[1] = t;
         for (value, slot) in self.last[2..].iter_mut().zip(&self.slots) {
             *value = block[slot.index()];
         }
+        self.add(t);
+    }
+
+    /// Adds consecutive points.
+    pub(crate) fn see_stretch(&mut self, stretch: &Stretch) {
+        let columns: Vec<&[f64]> = self.slots.iter().map(|slot| stretch.column(*slot)).collect();
+        if columns.is_empty() {
+            return;
+        }
+        for (k, t) in stretch.times().iter().enumerate() {
+            for (value, column) in self.last[2..].iter_mut().zip(&columns) {
+                *value = column[k];
+            }
+            self.add(*t);
+        }
+    }
+
+    /// Adds the values in the last row, at time `t` in s.
+    fn add(&mut self, t: f64) {
+        self.last[0] = self.seen as f64;
+        self.last[1] = t;
         self.seen += 1;
         if let Some(most) = self.most {
             if self.whole.len() <= most {

@@ -3,6 +3,7 @@
 use crate::run::observe::{Observer, check_finite, check_status};
 use crate::run::outcome::{Cause, Continue, Stop};
 use crate::run::stepper::{Rest, Stepper};
+use crate::run::stretch::Stretch;
 use abi::format;
 use abi::plan::Experiment;
 use abi::table::keep_time;
@@ -31,6 +32,9 @@ pub(crate) struct Fixed {
     seen: Vec<Range<usize>>,
     /// Steps at the end of a batch that store all outputs: one if the others leave some out, else none.
     full: u64,
+    /// The same slots without time, and their values after the calls since the last look.
+    series: Vec<Slot>,
+    stretch: Stretch,
 }
 
 impl Fixed {
@@ -61,6 +65,8 @@ impl Fixed {
             done: 0,
             seen: [Slot::COUNT].iter().chain(slots).map(one).collect(),
             full,
+            series: rest.observer.slots().iter().copied().filter(|slot| *slot != Slot::TIME).collect(),
+            stretch: Stretch::default(),
             rest,
         };
         match run.begin(begin) {
@@ -161,18 +167,23 @@ impl Stepper for Fixed {
     }
 
     fn series(&self) -> Option<(&[Slot], u64)> {
-        let Observer { probe, .. } = &self.rest.observer;
-        let is_plain = self.each && probe.next().is_none();
-        is_plain.then(|| (self.rest.observer.slots(), (self.batch - self.full - self.done).min(SERIES)))
+        let is_plain = self.each && self.rest.observer.probe.next().is_none();
+        is_plain.then(|| (&*self.series, (self.batch - self.full - self.done).min(SERIES)))
     }
 
-    fn show(&mut self, calls: u64, values: &dyn Fn(u64, &mut [f64])) -> Result<(), Stop> {
+    fn show(&mut self, calls: u64, column: &dyn Fn(usize, &mut [f64])) -> Result<(), Stop> {
         let Rest { instance, observer, .. } = &mut self.rest;
         let count = instance.get(Slot::COUNT);
-        for call in 0..calls {
+        let counts = (1..=calls).map(|call| count + call as f64);
+        self.stretch.fill(counts.clone().map(|count| count * self.step), &self.series, column);
+        if self.stretch.is_finite() {
+            observer.see_stretch(&self.stretch);
+            return Ok(());
+        }
+        for (point, count) in counts.enumerate() {
             let block = instance.block_mut();
-            values(call, block);
-            block[Slot::COUNT.index()] = count + (call + 1) as f64;
+            self.stretch.write(point, block);
+            block[Slot::COUNT.index()] = count;
             keep_time(block);
             observer.see(instance)?;
         }

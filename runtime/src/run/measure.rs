@@ -10,6 +10,7 @@ use crate::run::crossing::{Lobes, period, settling};
 use crate::run::hills::{Hills, Turn};
 use crate::run::peak::{Peak, Point};
 use crate::run::quadrature::{Even, Sum};
+use crate::run::stretch::{Stretch, greatest};
 use crate::run::verdict::{self, Reading, Verdict};
 use abi::Slot;
 use abi::format;
@@ -133,7 +134,15 @@ impl Expectations {
     /// Shows the state of the model at time `t` in s. Times must not decrease.
     pub fn see(&mut self, t: f64, block: &[f64]) {
         for meter in self.meters.iter_mut().flatten() {
-            meter.see_block(t, block);
+            meter.see_with(t, |slot| block[slot.index()]);
+        }
+    }
+
+    /// Shows consecutive points, with the bits of [`see`](Expectations::see) for one after the other. Their values are
+    /// finite.
+    pub(crate) fn see_stretch(&mut self, stretch: &Stretch) {
+        for meter in self.meters.iter_mut().flatten() {
+            meter.see_stretch(stretch);
         }
     }
 
@@ -375,9 +384,9 @@ impl Meter {
         }
     }
 
-    /// Adds a point, as a block; events may open or close the window there.
-    fn see_block(&mut self, t: f64, block: &[f64]) {
-        let holds = |slot: Option<Slot>| slot.is_some_and(|slot| block[slot.index()] != 0.0);
+    /// Adds a point, whose values `read` gives; events may open or close the window there.
+    fn see_with(&mut self, t: f64, read: impl Fn(Slot) -> f64) {
+        let holds = |slot: Option<Slot>| slot.is_some_and(|slot| read(slot) != 0.0);
         if holds(self.begins) {
             (self.begins, self.after) = (None, t);
         }
@@ -385,9 +394,62 @@ impl Meter {
             (self.ends, self.before) = (None, self.before.min(t));
         }
         if let Some(moment) = self.moment {
-            self.telling = block[moment.index()];
+            self.telling = read(moment);
         }
-        self.see(t, block[self.slot.index()]);
+        self.see(t, read(self.slot));
+    }
+
+    /// Adds consecutive points.
+    fn see_stretch(&mut self, stretch: &Stretch) {
+        let (times, values) = (stretch.times(), stretch.column(self.slot));
+        let Some(end) = times.last() else { return };
+        let is_watched = self.begins.or(self.ends).or(self.moment).is_some();
+        if is_watched || !self.counted || self.last.0 < self.after || *end > self.before {
+            let others = [self.begins, self.ends, self.moment].map(|slot| Some((slot?, stretch.column(slot?))));
+            for (k, (t, v)) in times.iter().zip(values).enumerate() {
+                let other = |slot| others.iter().flatten().find(|(known, _)| *known == slot).map(|(_, all)| all[k]);
+                self.see_with(*t, |slot| other(slot).unwrap_or(*v));
+            }
+        } else if !self.count_all(times, values) {
+            times.iter().zip(values).for_each(|(t, v)| self.see(*t, *v));
+        }
+    }
+
+    /// Adds points inside the window, of which it has counted some, in a closed form or a loop of its own; returns whether
+    /// there is one for this measure.
+    fn count_all(&mut self, times: &[f64], values: &[f64]) -> bool {
+        let (Some(t), Some(v)) = (times.last(), values.last()) else { return true };
+        match &mut self.tally {
+            Tally::Extremes { min, max, kind } => {
+                if !matches!(kind, Extreme::Max) {
+                    min.see_all(times, values);
+                }
+                if !matches!(kind, Extreme::Min) {
+                    max.see_all(times, values);
+                }
+            }
+            Tally::Sum { given: false, square, sum, even, .. } => {
+                if !even.goes_on(times) {
+                    return false;
+                }
+                let of = |v: f64| if *square { v * v } else { v };
+                let (mut t0, mut before) = (self.end.0, of(self.end.1));
+                for (t, v) in times.iter().zip(values) {
+                    let value = of(*v);
+                    sum.add(0.5 * (before + value) * (t - t0));
+                    (t0, before) = (*t, value);
+                }
+                even.push_all(*t, values.len(), values[values.len().saturating_sub(3)..].iter().map(|v| of(*v)));
+            }
+            Tally::Sum { given: true, .. } | Tally::Final => {}
+            Tally::At { instant, .. } if *t < *instant || *instant < self.end.0 => {}
+            Tally::TimeOf { peak } => peak.see_all(times, values),
+            _ => return false,
+        }
+        self.end = (*t, *v);
+        self.last = self.end;
+        self.scale = self.scale.max(greatest(values, f64::abs));
+        true
     }
 
     fn demand(&self) -> Demand {
@@ -441,9 +503,13 @@ impl Meter {
             self.first = (t, v);
         }
         match &mut self.tally {
-            Tally::Extremes { min, max, .. } => {
-                min.see(t, v);
-                max.see(t, v);
+            Tally::Extremes { min, max, kind } => {
+                if !matches!(kind, Extreme::Max) {
+                    min.see(t, v);
+                }
+                if !matches!(kind, Extreme::Min) {
+                    max.see(t, v);
+                }
             }
             Tally::Sum { given: true, .. } => {}
             Tally::Sum { square, sum, even, given: false, .. } => {
@@ -828,7 +894,7 @@ mod tests {
     /// One measure over points of time, the quantity, and the condition or quantity that defines the moment.
     fn told(kind: MeasureKind, window: Window, points: &[(f64, f64, f64)]) -> Result<(f64, Option<f64>), String> {
         let mut meter = Meter::new(&Measure { window, ..measure(kind) }, 0.0, f64::INFINITY);
-        points.iter().for_each(|(t, v, w)| meter.see_block(*t, &[*t, 0.0, *w, *v]));
+        points.iter().for_each(|(t, v, w)| meter.see_with(*t, |slot| [*t, 0.0, *w, *v][slot.index()]));
         meter.reading()
     }
 

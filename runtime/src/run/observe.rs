@@ -6,6 +6,7 @@
 use crate::record::Recorder;
 use crate::run::measure::Expectations;
 use crate::run::outcome::{Cause, Stop};
+use crate::run::stretch::Stretch;
 use abi::description::Kind;
 use abi::plan::Experiment;
 use abi::{Instance, Slot};
@@ -100,6 +101,12 @@ impl Observer {
         if for_all {
             self.recorder.see(time, block);
         }
+    }
+
+    /// Adds consecutive points, whose values are finite, with the bits of [`see`](Observer::see) for one after the other.
+    pub(crate) fn see_stretch(&mut self, stretch: &Stretch) {
+        self.expectations.see_stretch(stretch);
+        self.recorder.see_stretch(stretch);
     }
 
     /// Names the observed value that is not finite. States come first, because a bad state explains a bad expression.

@@ -5,6 +5,8 @@
 //! extrapolated from both sides. A run with half the step has a point at the same time, so its agreement there gives no
 //! information about the signal in between.
 
+use crate::run::stretch::greatest;
+
 /// A point: time in s, value in SI.
 pub(crate) type Point = (f64, f64);
 
@@ -42,6 +44,34 @@ impl Peak {
         }
         self.last = [Some(point), self.last[0]];
         higher
+    }
+
+    /// Adds points one after the other, as [`see`](Peak::see) does. Values must be finite.
+    pub(crate) fn see_all(&mut self, times: &[f64], values: &[f64]) {
+        let at = |k: usize| (times[k], self.sign * values[k]);
+        let len = values.len();
+        let highest = greatest(values, |value| self.sign * value);
+        if highest > self.at.1 {
+            let k = values.iter().position(|value| self.sign * value == highest).expect("it is one of them");
+            // The points before one of these, later one first.
+            let before = |k: usize| match k {
+                0 => self.last,
+                1 => [Some(at(0)), self.last[0]],
+                _ => [Some(at(k - 1)), Some(at(k - 2))],
+            };
+            let after = [k + 1, k + 2].map(|k| (k < len).then(|| at(k)));
+            (self.at, self.before, self.after) = (at(k), before(k), after);
+        } else {
+            let mut next = (0..len).map(at);
+            for free in self.after.iter_mut().filter(|place| place.is_none()) {
+                *free = next.next();
+            }
+        }
+        self.last = match len {
+            0 => self.last,
+            1 => [Some(at(0)), self.last[0]],
+            _ => [Some(at(len - 1)), Some(at(len - 2))],
+        };
     }
 
     /// The extreme among the points: time in s, value in SI.

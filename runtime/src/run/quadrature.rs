@@ -23,8 +23,7 @@ impl Even {
         let goes_on = match self.points {
             0 => true,
             1 => step > 0.0,
-            // Times are multiples of the step, rounded independently.
-            _ => (step - self.step).abs() <= 1e-9 * self.step + 8.0 * f64::EPSILON * t.abs(),
+            _ => is_even(step, self.step, t),
         };
         let correction = if goes_on { None } else { Some(self.correction()) };
         if !goes_on {
@@ -46,6 +45,25 @@ impl Even {
         correction
     }
 
+    /// Whether these times in s continue the sequence, so that adding their points gives no correction.
+    pub(crate) fn goes_on(&self, times: &[f64]) -> bool {
+        // A loop without branches, for vectors.
+        let next = |last: f64, t: f64| u64::from(is_even(t - last, self.step, t));
+        let inside: u64 = times.windows(2).map(|pair| next(pair[0], pair[1])).sum();
+        match times {
+            [] => true,
+            [first, rest @ ..] => self.points >= 3 && next(self.last, *first) + inside == 1 + rest.len() as u64,
+        }
+    }
+
+    /// Adds points that [continue](Even::goes_on) the sequence: the time of the last one in s, and how many there are;
+    /// `last` are the values of the last ones, at least of three or of all.
+    pub(crate) fn push_all(&mut self, t: f64, points: usize, last: impl Iterator<Item = f64>) {
+        last.for_each(|v| self.tail = [self.tail[1], self.tail[2], v]);
+        self.points += points as u64;
+        self.last = t;
+    }
+
     /// The end correction of the sequence so far; 0 for fewer than five points.
     pub(crate) fn correction(&self) -> f64 {
         if self.points < 5 {
@@ -54,6 +72,11 @@ impl Even {
         let ([a, b, c], [x, y, z]) = (self.head, self.tail);
         self.step / 12.0 * ((b - a) - (z - y)) - self.step / 24.0 * ((a - 2.0 * b + c) + (x - 2.0 * y + z))
     }
+}
+
+/// Whether the distance of two points is that of the others. Times are multiples of the step, rounded independently.
+fn is_even(step: f64, others: f64, t: f64) -> bool {
+    (step - others).abs() <= 1e-9 * others + 8.0 * f64::EPSILON * t.abs()
 }
 
 /// A compensated sum (Neumaier, 1974): rounding errors stay negligible over ten million steps.

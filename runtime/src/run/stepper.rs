@@ -17,14 +17,16 @@ pub(crate) trait Stepper {
     /// the run. `watch` receives the fraction done and may stop the run.
     fn next(&mut self, watch: &mut dyn FnMut(f64) -> Continue) -> Result<Option<u64>, Stop>;
 
-    /// If this run reads its block after every call: the slots that it reads, and how many calls may be made before
-    /// [`take`](Stepper::take) if [`show`](Stepper::show) receives those slots after each call but the last.
+    /// If this run reads its block after every call: the slots that it reads, apart from time, and how many calls may be made
+    /// before [`take`](Stepper::take) if [`show`](Stepper::show) receives those slots after each call but the
+    /// last.
     fn series(&self) -> Option<(&[Slot], u64)> {
         None
     }
 
     /// Receives such values: those after the first `calls` calls since the last `take`. All of these have returned 0.
-    fn show(&mut self, _calls: u64, _values: &dyn Fn(u64, &mut [f64])) -> Result<(), Stop> {
+    /// `column` writes the values of the slot with a given number after each of the calls.
+    fn show(&mut self, _calls: u64, _column: &dyn Fn(usize, &mut [f64])) -> Result<(), Stop> {
         unreachable!("it has no series")
     }
 
