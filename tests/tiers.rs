@@ -5,7 +5,8 @@
 //!
 //! Mutants tried by hand. Each fails with seed 2: a call that the interpreter began starts over once there is code; its
 //! rest is dropped. Each fails within the default seeds: a step that leaves out outputs drops its guards of ranges; the
-//! last step of a run leaves them out too; a run that reads an output which its slice leaves out takes the slice.
+//! last step of a run leaves them out too; a run that reads an output which its slice leaves out takes the slice; the times
+//! of a series are those after it.
 //!
 //! `FRIC_SEED`, `FRIC_RUNS` (default 120 runs).
 
@@ -23,6 +24,7 @@ use compiler::experiment::Variant;
 use compiler::ir::program::Program;
 use compiler::ir::random::Random;
 use runtime::engine::{Cause, Continue, Failure};
+use runtime::record::Recording;
 use std::path::PathBuf;
 use std::sync::Arc;
 use support::{Texts, number};
@@ -35,15 +37,18 @@ fn variant(name: &str, text: &str, experiment: &str, changes: Changes) -> Option
     read.ok()?.into_iter().next().filter(|variant| variant.rig.is_none())
 }
 
-/// The final block, what was measured, and how the run ended.
-fn run(variant: &Variant, policy: Policy) -> (Vec<u64>, String) {
+/// The final block, what was measured, how the run ended, and what it recorded.
+fn run(variant: &Variant, policy: Policy) -> (Vec<u64>, String, Recording) {
     let (program, method) = (&variant.program, variant.experiment.solver.method);
     let code = tiered(program, method, policy);
     let instance = Instance::new(Arc::new(program.description.clone()), code, &program.params);
     let mut watch = |_| Continue::Continue(());
     let (instance, ended) = runtime::engine::run_on(instance, &variant.experiment, &mut |_| (), &mut watch);
-    let ended = ended.map(|outcome| (outcome.verdicts, outcome.work.steps)).map_err(|failure| failure.to_string());
-    (instance.block().iter().map(bits).collect(), format!("{ended:?}"))
+    let (ended, recording) = match ended {
+        Ok(outcome) => (format!("{:?}", (outcome.verdicts, outcome.work.steps)), outcome.recording),
+        Err(failure) => (failure.to_string(), failure.recording),
+    };
+    (instance.block().iter().map(bits).collect(), ended, recording)
 }
 
 /// The status of each of several calls for so many steps, and the block after it.

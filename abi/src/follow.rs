@@ -9,7 +9,7 @@ use std::any::Any;
 use std::sync::Arc;
 
 compiled! {
-    /// Machine code of the loop: up to `count` fixed steps, as an [`Entry`](crate::table::Entry) makes them. Step `i` has
+    /// Machine code of the loop: up to `count` fixed steps, as the code of the step makes them. Step `i` has
     /// input `k` from `inputs[i · strides[0] + k]` instead of its slot, and writes output `k` to
     /// `outputs[i · strides[1] + k]`, also if its status is not 0. `strides` are in bytes. The slots of these inputs keep
     /// their values.

@@ -206,6 +206,18 @@ impl Instance {
         self.call_up_to(Function::Step, n)
     }
 
+    /// As [`advance`](Instance::advance), and writes the values of these slots to a row after each step, if there is machine
+    /// code for that by now. Returns the number of steps and the last status; else nothing has happened.
+    ///
+    /// # Panics
+    /// If there is less room than for `n` rows, or as [`Follow::new`](crate::follow::Follow::new): a bug in the caller.
+    pub fn advance_recording(&mut self, slots: &[Slot], rows: &mut [f64], n: u64) -> Option<(u64, u64)> {
+        let Code::Interpreted(code) = &self.step else { return None };
+        let follow = code.recording(slots)?;
+        let none = Rows { numbers: &[], stride: 0 };
+        Some(self.follow(&follow, none, RowsMut { numbers: rows, stride: slots.len() }, n))
+    }
+
     /// Makes a fixed step for each of `count` rows: with the inputs of this row, and then writes the outputs to a row. Stops
     /// at the first status that is not 0, after writing its row. Returns the number of steps and the status. The bits are
     /// those of [`set`](Instance::set), [`advance`](Instance::advance) and [`get`](Instance::get) for each row.

@@ -2,6 +2,7 @@
 
 use crate::description::Slot;
 use crate::distributed_step::DistributedStep;
+use crate::follow::Follow;
 use std::any::Any;
 use std::sync::Arc;
 
@@ -102,6 +103,11 @@ pub trait Interpret: Send + Sync {
     fn has(&self, function: Function) -> bool;
     /// Machine code of the function, if it has been compiled by now.
     fn made(&self, _: Function) -> Option<&Machine> {
+        None
+    }
+    /// The fixed step in a loop that writes these slots to a row after each step, without inputs from rows, if that has been
+    /// compiled by now. It is compiled because it is asked for.
+    fn recording(&self, _outputs: &[Slot]) -> Option<Arc<Follow>> {
         None
     }
 }

@@ -10,6 +10,7 @@
 pub mod rng;
 pub mod format;
 pub mod spsc;
+mod stretch;
 
 pub mod record;
 

@@ -158,7 +158,8 @@ pub fn on_demand(program: &Program, method: Method, interpret: bool) -> Code {
 
 /// Tiered code with a policy of its own.
 pub fn tiered(program: &Program, method: Method, policy: Policy) -> Code {
-    let functions = Functions { program: program.clone(), method, policy, forms: Default::default() };
+    let (forms, recording) = Default::default();
+    let functions = Functions { program: program.clone(), method, policy, forms, recording };
     Code::Interpreted(Arc::new(Tiered(Arc::new(functions))))
 }
 
@@ -213,6 +214,18 @@ struct Functions {
     method: Method,
     policy: Policy,
     forms: [Forms; Function::ALL.len()],
+    recording: Recording,
+}
+
+/// The fixed step in a loop that records. A program has one: its runs are those of one plan, and read the same slots.
+#[derive(Default)]
+struct Recording {
+    /// The slots that were first asked for.
+    slots: OnceLock<Box<[Slot]>>,
+    /// The inner `None` means that there is no machine code for it.
+    code: OnceLock<Option<Arc<Follow>>>,
+    /// Whether somebody compiles it or has done so.
+    is_claimed: AtomicBool,
 }
 
 /// The forms of one function, each built when it is first needed.
@@ -284,13 +297,24 @@ impl Functions {
         };
         self.compiled(which, registers).machine.get_or_init(|| self.make(which, make));
     }
+
+    fn compile_recording(&self) {
+        let slots = self.recording.slots.get().expect("it was asked for");
+        let make = || follow(&self.program, self.method, &[], slots, false);
+        self.recording.code.get_or_init(|| Some(make()).filter(Follow::is_compiled).map(Arc::new));
+    }
 }
+
+/// A step that records is compiled first. It pays to compile the step as such too after so many times as many runs.
+const BESIDE_RECORDING: u64 = 16;
 
 impl Tiered {
     /// Compiles a function if that pays by now and nobody has begun to.
     fn consider(&self, which: Function) {
         let (runs, policy) = (self.0.forms[which as usize].runs.load(Ordering::Relaxed), &self.0.policy);
-        let pays = |thresholds: &Thresholds| thresholds[which as usize].is_some_and(|after| runs >= after);
+        let records = which == Function::Step && self.0.recording.slots.get().is_some();
+        let times = if records { BESIDE_RECORDING } else { 1 };
+        let pays = |thresholds: &Thresholds| thresholds[which as usize].is_some_and(|after| runs >= times * after);
         let registers = match (pays(&policy.compiled_after), pays(&policy.quickly_after)) {
             (true, _) => Registers::Backtracking,
             (false, true) => Registers::SinglePass,
@@ -299,11 +323,15 @@ impl Tiered {
         if self.0.compiled(which, registers).is_claimed.swap(true, Ordering::Relaxed) {
             return;
         }
-        let functions = self.0.clone();
-        let background = || Builder::new().name("compiler".into()).spawn(move || functions.compile(which, registers));
-        // Where no thread can be had, the caller compiles.
-        if !policy.in_background || background().is_err() {
-            self.0.compile(which, registers);
+        self.compile(move |functions| functions.compile(which, registers));
+    }
+
+    /// Compiles in a thread of its own if the policy says so. Where no thread can be had, the caller compiles.
+    fn compile(&self, make: impl Fn(&Functions) + Clone + Send + 'static) {
+        let (functions, own) = (self.0.clone(), make.clone());
+        let background = || Builder::new().name("compiler".into()).spawn(move || own(&functions));
+        if !self.0.policy.in_background || background().is_err() {
+            make(&self.0);
         }
     }
 }
@@ -343,6 +371,19 @@ impl Interpret for Tiered {
 
     fn made(&self, which: Function) -> Option<&Machine> {
         self.0.best(which)
+    }
+
+    fn recording(&self, outputs: &[Slot]) -> Option<Arc<Follow>> {
+        let Recording { slots, code, is_claimed } = &self.0.recording;
+        if **slots.get_or_init(|| outputs.into()) != *outputs {
+            return None;
+        }
+        let runs = self.0.forms[Function::Step as usize].runs.load(Ordering::Relaxed);
+        let pays = self.0.policy.compiled_after[Function::Step as usize].is_some_and(|after| runs >= after);
+        if code.get().is_none() && pays && !is_claimed.swap(true, Ordering::Relaxed) {
+            self.compile(Functions::compile_recording);
+        }
+        code.get()?.clone()
     }
 
     fn has(&self, which: Function) -> bool {

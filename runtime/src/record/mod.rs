@@ -10,7 +10,7 @@ mod packed;
 pub mod parts;
 pub mod log;
 
-use crate::run::stretch::Stretch;
+use crate::stretch::Stretch;
 use abi::Slot;
 use abi::plan::{Plot, Series};
 use abi::unit::Unit;

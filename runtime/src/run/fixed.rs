@@ -3,7 +3,7 @@
 use crate::run::observe::{Observer, check_finite, check_status};
 use crate::run::outcome::{Cause, Continue, Stop};
 use crate::run::stepper::{Rest, Stepper};
-use crate::run::stretch::Stretch;
+use crate::stretch::Stretch;
 use abi::format;
 use abi::plan::Experiment;
 use abi::table::keep_time;
@@ -172,8 +172,9 @@ impl Stepper for Fixed {
     }
 
     fn show(&mut self, calls: u64, column: &dyn Fn(usize, &mut [f64])) -> Result<(), Stop> {
-        let Rest { instance, observer, .. } = &mut self.rest;
-        let count = instance.get(Slot::COUNT);
+        let Rest { instance, observer, work, .. } = &mut self.rest;
+        // The block may be that before the calls or after them.
+        let count = (work.steps + self.done) as f64;
         let counts = (1..=calls).map(|call| count + call as f64);
         self.stretch.fill(counts.clone().map(|count| count * self.step), &self.series, column);
         if self.stretch.is_finite() {

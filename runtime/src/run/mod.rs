@@ -7,7 +7,6 @@ pub mod verdict;
 pub(crate) mod peak;
 pub(crate) mod hills;
 pub(crate) mod quadrature;
-pub(crate) mod stretch;
 pub(crate) mod crossing;
 pub mod measure;
 pub(crate) mod outcome;

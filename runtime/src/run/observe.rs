@@ -6,7 +6,7 @@
 use crate::record::Recorder;
 use crate::run::measure::Expectations;
 use crate::run::outcome::{Cause, Stop};
-use crate::run::stretch::Stretch;
+use crate::stretch::Stretch;
 use abi::description::Kind;
 use abi::plan::Experiment;
 use abi::{Instance, Slot};

@@ -5,7 +5,7 @@
 //! extrapolated from both sides. A run with half the step has a point at the same time, so its agreement there gives no
 //! information about the signal in between.
 
-use crate::run::stretch::greatest;
+use crate::stretch::greatest;
 
 /// A point: time in s, value in SI.
 pub(crate) type Point = (f64, f64);

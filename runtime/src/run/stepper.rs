@@ -68,9 +68,28 @@ impl Rest {
 /// Runs it alone to its end, or to the reason to stop.
 pub(crate) fn alone(course: &mut dyn Stepper, watch: &mut dyn FnMut(f64) -> Continue) -> Result<(), Stop> {
     let function = course.function();
+    let mut rows = Vec::new();
     while let Some(count) = course.next(watch)? {
-        let status = course.instance().call_up_to(function, count);
-        course.take(count, status)?;
+        let (done, status) = match in_series(course, &mut rows)? {
+            Some(made) => made,
+            None => (count, course.instance().call_up_to(function, count)),
+        };
+        course.take(done, status)?;
     }
     Ok(())
+}
+
+/// Makes the calls of a series in one, if there is code that records the slots, and shows all but the last. Returns their
+/// number and the last status.
+fn in_series(course: &mut dyn Stepper, rows: &mut Vec<f64>) -> Result<Option<(u64, u64)>, Stop> {
+    let Some((slots, most)) = course.series() else { return Ok(None) };
+    let slots = slots.to_vec();
+    rows.resize(most as usize * slots.len(), 0.0);
+    let Some((done, status)) = course.instance().advance_recording(&slots, rows, most) else { return Ok(None) };
+    let column = |slot: usize, to: &mut [f64]| {
+        let values = rows[slot..].iter().step_by(slots.len());
+        to.iter_mut().zip(values).for_each(|(to, value)| *to = *value);
+    };
+    course.show(done - 1, &column)?;
+    Ok(Some((done, status)))
 }
