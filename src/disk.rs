@@ -30,7 +30,10 @@ impl Sources for Disk {
                 let path = project::path_named(from, path)?;
                 Ok((path.display().to_string(), rig_log::table(&path)?))
             }
-            None | Some(Format::Csv) => project::Disk.file(from, path),
+            None | Some(Format::Csv) => match recording_files::conversion(Path::new(path)) {
+                Some(how) => Err(how),
+                None => project::Disk.file(from, path),
+            },
             Some(format) => {
                 let (path, bytes) = project::bytes_named(from, path)?;
                 Ok((path.display().to_string(), recording_files::text(bytes, format)?))

@@ -33,6 +33,29 @@ impl Format {
     }
 }
 
+/// How a file of a format that is not read becomes one that is; none for other endings.
+pub fn conversion(path: &Path) -> Option<String> {
+    let ending = path.extension().and_then(|ending| ending.to_str())?.to_ascii_lowercase();
+    let (format, line) = match ending.as_str() {
+        "h5" | "hdf5" => ("HDF5", "pandas.read_hdf('FILE').to_parquet('recording.parquet', compression='snappy')"),
+        "mf4" | "mdf" => (
+            "MDF",
+            "asammdf.MDF('FILE').to_dataframe(raster=0.001).reset_index().to_parquet('recording.parquet', compression='snappy')",
+        ),
+        "mcap" | "bag" | "db3" => (
+            "a ROS bag",
+            "rosbags.dataframe.get_dataframe(AnyReader([Path('FILE')]), topic, fields).to_parquet('recording.parquet', compression='snappy')",
+        ),
+        "xlsx" | "xls" | "ods" => (
+            "a spreadsheet",
+            "pandas.read_excel('FILE').to_parquet('recording.parquet', compression='snappy'), or save it as CSV",
+        ),
+        _ => return None,
+    };
+    let file = path.file_name().map_or_else(String::new, |name| name.to_string_lossy().into_owned());
+    Some(format!("{format} is not read; convert it: {}", line.replace("FILE", &file)))
+}
+
 /// A recording as the bytes of a file.
 ///
 /// # Errors

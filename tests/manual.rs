@@ -40,7 +40,8 @@ fn wrong(block: &Block) -> Vec<String> {
     let recording = "t [s],v [mm/s]\n0,0\n1,5\n2,3\n";
     let dbc = include_str!("../examples/rtfs/shaft.dbc");
     let bench = ("bench.csv".into(), "0,1,1\n1,2,2\n2,3,3\n".into());
-    let sources = Texts(vec![("shaft.dbc".into(), dbc.into()), ("pull.csv".into(), recording.into()), bench]);
+    let uneven = ("uneven.csv".into(), "t [s],x [mm]\n0,0\n1,1\n2.3,3\n".into());
+    let sources = Texts(vec![("shaft.dbc".into(), dbc.into()), ("pull.csv".into(), recording.into()), bench, uneven]);
     let (mut loaded, found) = checked("page.fric", &block.text, &sources);
     let mut out: Vec<String> = found.iter().map(|diagnostic| line(&loaded, diagnostic)).collect();
     if !found.iter().any(|diagnostic| diagnostic.is_error()) {

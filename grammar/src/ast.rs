@@ -453,6 +453,7 @@ pub enum ExperimentStatement {
     Solver(Solver),
     Sweep(Sweep),
     Data(Data),
+    Derived(Derived),
     Plot(Plot),
     /// `tune fr.Fs in 1 N .. 2 N, fr.vs`
     Tune(Vec<Tuned>, Span),
@@ -562,12 +563,23 @@ pub struct Data {
     pub span: Span,
 }
 
+/// `let data.v = slope(data.x)`: a column that is computed from others, row by row.
+#[derive(Clone, PartialEq, Debug)]
+#[allow(missing_docs)]
+pub struct Derived {
+    pub name: Name,
+    pub value: Expr,
+    pub span: Span,
+}
+
 /// `x [mm] = "Position"`: a column of a recording. Without a unit it has that of the heading.
 #[derive(Clone, PartialEq, Debug)]
 #[allow(missing_docs)]
 pub struct Column {
     pub name: Name,
     pub unit: Option<UnitText>,
+    /// Its value stays until the next row, rather than changing linearly.
+    pub hold: bool,
     /// Its heading in the file; without one it is found by its name or by its place.
     pub heading: Option<Text>,
 }

@@ -462,6 +462,7 @@ impl<'s, 't> Layout<'s, 't> {
             (Some(Place::Interface), _) => ("port", true),
             (Some(Place::Device), "send" | "read") => ("signal", true),
             (Some(Place::Rig), "bus" | "drive" | "device") => ("bus", false),
+            (Some(Place::Experiment | Place::Fit | Place::Case), "let") => ("derived", true),
             (_, "param" | "input" | "output" | "state" | "let") => (word, unit),
             (_, "part" | "go" | "next") => (word, false),
             _ if self.source.word(first + 1) == "/" => ("derivative", false),

@@ -813,6 +813,12 @@ impl<'t> Reader<'t> {
                     columns: children.all(Rule::column).into_iter().map(|column| self.column(column)).collect(),
                     span,
                 }),
+                Rule::derived => {
+                    children.maybe(Rule::kw_data);
+                    let name = self.name(children.one());
+                    let value = self.value(&mut children);
+                    ExperimentStatement::Derived(Derived { name, value, span })
+                }
                 Rule::plot => {
                     let [last, after, before] =
                         [Rule::kw_against, Rule::kw_after, Rule::kw_before].map(|word| says(&pair, word));
@@ -1037,10 +1043,11 @@ impl<'t> Reader<'t> {
     }
 
     fn column(&self, pair: Pair<Rule>) -> Column {
+        let hold = says(&pair, Rule::kw_hold);
         let mut children = Children::of(pair);
         let (name, unit) = (self.name(children.one()), self.maybe_unit(&mut children));
         children.maybe(Rule::eq);
-        Column { name, unit, heading: children.maybe(Rule::string).map(|heading| self.string(heading)) }
+        Column { name, unit, hold, heading: children.maybe(Rule::string).map(|heading| self.string(heading)) }
     }
 
     fn curve(&mut self, pair: Pair<'t, Rule>) -> Curve {

@@ -377,6 +377,7 @@ impl Found {
                         }
                         ExperimentStatement::Solver(_)
                         | ExperimentStatement::Data(_)
+                        | ExperimentStatement::Derived(_)
                         | ExperimentStatement::Plot(_)
                         | ExperimentStatement::Tune(..)
                         | ExperimentStatement::Expect(_)

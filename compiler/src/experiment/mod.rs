@@ -9,6 +9,8 @@ pub mod held;
 pub mod of_fit;
 mod plots;
 mod recording;
+pub mod filters;
+pub mod derived;
 pub mod start_values;
 mod sweeps;
 pub mod vary;
@@ -18,6 +20,7 @@ pub use expectations::is_number_of_peak;
 pub use sweeps::spaced;
 
 use command_line::{CommandLine, also};
+use derived::derive;
 use expectations::ExpectAt;
 use plots::{CurveAt, PlotAt};
 use recording::recording;
@@ -160,6 +163,8 @@ struct Statements<'a> {
     solver: Option<&'a ast::Solver>,
     sweeps: Vec<&'a ast::Sweep>,
     data: Option<&'a ast::Data>,
+    /// Columns that are computed from the others.
+    derived: Vec<&'a ast::Derived>,
     plots: Vec<&'a ast::Plot>,
     tunes: Vec<&'a ast::Tuned>,
     expects: Vec<&'a ast::Expect>,
@@ -249,6 +254,15 @@ pub fn read(
     let data =
         parts.data.map_or(Some(Vec::new()), |data| recording(loaded, sources, root, data, steady, &mut diagnostics));
     let Some(mut data) = data else { return Err(diagnostics) };
+    if let (None, Some(first)) = (parts.data, parts.derived.first()) {
+        let error = Diagnostic::error("E0903", "there is no recording").label(first.span, "a column of it");
+        diagnostics.push(error.help("add `data \"bench.csv\" (t [s], x [mm])`"));
+        return Err(diagnostics);
+    }
+    let texts = (loaded, sources, root);
+    if derive(texts, &parts.derived, &mut data, steady, &mut diagnostics).is_none() {
+        return Err(diagnostics);
+    }
     let (mut rows, mut begins) = (Vec::new(), 0.0);
     if let (Some(fit), Some((_, first, _))) = (fit, data.first()) {
         if steady {
@@ -358,7 +372,7 @@ fn parts<'a>(
     let mut run: Option<&ast::Run> = None;
     let mut parts = (None, Vec::new(), None, Vec::new(), Vec::new());
     let (mut stepped, mut allowed, mut tunes) = (false, Vec::new(), Vec::new());
-    let mut unknown = Vec::new();
+    let (mut unknown, mut derived) = (Vec::new(), Vec::new());
     let mut records: Vec<&ast::Record> = Vec::new();
     let mut twice = |what: &str, span: Span, first: Span| {
         let error = Diagnostic::error("E0301", format!("an experiment has one `{what}`"))
@@ -381,6 +395,7 @@ fn parts<'a>(
                 Some(first) => twice("data", one.span, std::convert::identity::<&ast::Data>(first).span),
                 None => parts.2 = Some(one),
             },
+            ExperimentStatement::Derived(one) => derived.push(one),
             ExperimentStatement::Plot(one) => parts.3.push(one),
             ExperimentStatement::Tune(all, _) => tunes.extend(all),
             ExperimentStatement::Expect(one) => parts.4.push(one),
@@ -410,6 +425,7 @@ fn parts<'a>(
         solver,
         sweeps,
         data,
+        derived,
         plots,
         tunes,
         expects,

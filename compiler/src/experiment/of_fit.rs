@@ -11,26 +11,40 @@ use abi::unit::Unit;
 use grammar::ast::{self, BinaryOp, ExperimentStatement, Expr, ExprKind, FitStatement};
 use grammar::diagnostic::Diagnostic;
 
-/// `rms(e)` or `rms(e) / s`: e and s.
-pub fn compared(item: &Expr) -> Option<(&Expr, Option<&Expr>)> {
+/// What an item of `minimise` compares.
+#[derive(Clone, Copy)]
+pub struct Compared<'a> {
+    /// The difference.
+    pub of: &'a Expr,
+    /// The standard deviation of the measurement.
+    pub sd: Option<&'a Expr>,
+    /// `thin(e, n)`: of so many rows one is kept.
+    pub thin: Option<&'a Expr>,
+}
+
+/// `rms(e)`, `rms(thin(e, n))`, or either divided by a deviation.
+pub fn compared(item: &Expr) -> Option<Compared<'_>> {
     match &item.kind {
         ExprKind::Call { function, args, window: None } if function.text == "rms" && args.len() == 1 => {
-            Some((&args[0], None))
+            Some(match &args[0].kind {
+                ExprKind::Call { function, args, window: None } if function.text == "thin" && args.len() == 2 => {
+                    Compared { of: &args[0], sd: None, thin: Some(&args[1]) }
+                }
+                _ => Compared { of: &args[0], sd: None, thin: None },
+            })
         }
         ExprKind::Binary(BinaryOp::Divide, _, left, right) => match compared(left)? {
-            (of, None) => Some((of, Some(right))),
-            _ => None,
+            whole @ Compared { sd: None, .. } => Some(Compared { sd: Some(right), ..whole }),
+            Compared { sd: Some(_), .. } => None,
         },
         _ => None,
     }
 }
 
-/// The measure of an item, without the deviation by which it is divided.
-fn measure(item: &Expr) -> &Expr {
-    match &item.kind {
-        ExprKind::Binary(BinaryOp::Divide, _, left, _) => left,
-        _ => item,
-    }
+/// The measure of an item over time: without a filter, and without the deviation by which it is divided.
+fn measure(item: &Expr, of: &Expr) -> Expr {
+    let name = ast::Name { text: "rms".into(), span: item.span };
+    Expr { kind: ExprKind::Call { function: name, args: vec![of.clone()], window: None }, span: item.span }
 }
 
 /// A run of a fit: one of its cases, with one of its recordings.
@@ -181,11 +195,11 @@ pub fn experiment_of(fit: &ast::Fit) -> ast::Experiment {
             FitStatement::Vary(..) | FitStatement::Case(_) | FitStatement::Validate(..) => {}
             FitStatement::Minimise(minimise) => {
                 for item in &minimise.items {
-                    let Some((of, _)) = compared(item) else { continue };
+                    let Some(Compared { of, .. }) = compared(item) else { continue };
                     curves.push(show(of));
                     curves.extend(sides(of).into_iter().flatten().map(show));
                     measures.push(ExperimentStatement::Expect(ast::Expect {
-                        value: measure(item).clone(),
+                        value: measure(item, of),
                         near: None,
                         shows: Some(None),
                         after: None,

@@ -68,6 +68,7 @@ pub(super) fn recording(
             x_unit: Unit::si(seconds),
             y_unit: unit.clone(),
             smooth: false,
+            held: column.hold,
             x: t.clone(),
             y,
         };

@@ -7,7 +7,9 @@ mod unknown;
 
 pub use unknown::Unknown;
 
-use crate::experiment::of_fit::{self, compared, reads_recording, sides};
+use crate::experiment::derived::equidistant;
+use crate::experiment::filters::Thin;
+use crate::experiment::of_fit::{self, Compared, compared, reads_recording, sides};
 use crate::experiment::vary::{Varying, param_of};
 use crate::experiment::{self, Changes, Variant, held};
 use crate::fit::unknown::{typical, unknown};
@@ -81,8 +83,8 @@ pub struct Asks {
     pub solver_given: bool,
     /// The model that the fit runs, as written.
     pub model: String,
-    /// The rows that are compared.
-    compared: usize,
+    /// How many residuals it has.
+    residuals: usize,
 }
 
 /// A compared quantity.
@@ -96,8 +98,25 @@ pub struct Item {
     pub unit: Unit,
     /// Standard deviation of the measurement in SI, if it is given.
     pub sd: Option<f64>,
+    /// The filter of `thin`.
+    pub thin: Option<Thin>,
     /// Both sides of the difference, as written, with their slots; none if it is not a difference.
     pub sides: Option<[(String, Slot); 2]>,
+}
+
+impl Item {
+    /// What is compared, as written.
+    pub fn shown(&self) -> String {
+        match &self.thin {
+            Some(thin) => format!("thin({}, {})", self.text, thin.n),
+            None => self.text.clone(),
+        }
+    }
+
+    /// The rows of its residuals, of those at these times.
+    pub fn kept(&self, times: &[f64]) -> Vec<usize> {
+        self.thin.as_ref().map_or_else(|| (0..times.len()).collect(), |thin| thin.kept(times))
+    }
 }
 
 /// The statements of a run of a fit that are no experiment's.
@@ -105,8 +124,8 @@ struct Parts<'a> {
     run: &'a ast::Run,
     vary: Vec<&'a ast::Vary>,
     minimise: &'a ast::Minimise,
-    /// The compared expressions and their standard deviations.
-    items: Vec<(&'a Expr, Option<&'a Expr>)>,
+    /// The compared expressions.
+    items: Vec<Compared<'a>>,
 }
 
 /// A run of a fit, lowered.
@@ -293,7 +312,7 @@ fn few(found: &[(Run, ast::Fit)], unknowns: &[Unknown]) -> Option<(usize, usize)
     let count = |k: usize| {
         let asks = &found[k].0.asks;
         let own = unknowns.iter().filter(|unknown| unknown.of == Some(k)).count();
-        (asks.compared * asks.items.len(), own)
+        (asks.residuals, own)
     };
     let counts: Vec<(usize, usize)> = (0..found.len()).map(count).collect();
     let rows: usize = counts.iter().map(|(rows, _)| rows).sum();
@@ -525,6 +544,7 @@ fn parts<'a>(fit: &'a ast::Fit, kind: &str) -> Result<Parts<'a>, Vec<Diagnostic>
             }
             FitStatement::Experiment(
                 ExperimentStatement::Solver(_)
+                | ExperimentStatement::Derived(_)
                 | ExperimentStatement::Sweep(_)
                 | ExperimentStatement::Plot(_)
                 | ExperimentStatement::Tune(..)
@@ -593,7 +613,6 @@ fn asks(
     diagnostics: &mut Vec<Diagnostic>,
 ) -> Option<Asks> {
     let plots = &variant.experiment.plots;
-    let items = items(loaded, parts, plots.last()?, diagnostics);
     let second = Dimension::of([0, 0, 1, 0, 0]);
     let mut time = |edge: Option<&Expr>, open: f64| edge.map_or(Some(open), |edge| number(edge, second, diagnostics));
     let after = time(parts.minimise.after.as_ref(), 0.0)?;
@@ -604,13 +623,19 @@ fn asks(
         let error = Diagnostic::error("E0902", "steady points have no time").label(time.span, "a time");
         diagnostics.push(error.help("leave it out, or name the column of times `t`"));
     }
-    let compared = rows.iter().filter(|t| (after..=before).contains(*t)).count();
-    if compared == 0 {
+    let compared: Vec<f64> = rows.iter().copied().filter(|t| (after..=before).contains(t)).collect();
+    let items = match compared.is_empty() {
+        true => Vec::new(),
+        false => items(loaded, parts, plots.last()?, (&compared, variant.steady), diagnostics),
+    };
+    if compared.is_empty() {
         let end = rows.last().copied().unwrap_or(0.0);
         let error = Diagnostic::error("E0902", "no row of the recording is compared")
             .label(parts.minimise.span, format!("the recording goes from 0 s to {end} s"));
         diagnostics.push(error.help("write a window that holds rows; time begins at the first row"));
     }
+    let residuals = |item: &Item| compared.len().div_ceil(item.thin.as_ref().map_or(1, |thin| thin.n));
+    let residuals = items.iter().map(residuals).sum();
     Some(Asks {
         label: String::new(),
         recording: String::new(),
@@ -627,14 +652,47 @@ fn asks(
         solver_given,
         regimes: !variant.system.automata.is_empty(),
         model: parts.run.instance.model.text.clone(),
-        compared,
+        residuals,
     })
 }
 
-fn items(loaded: &Loaded, parts: &Parts, plot: &Plot, diagnostics: &mut Vec<Diagnostic>) -> Vec<Item> {
+/// The filter of `thin(e, n)` for rows at these times in s.
+fn thinned(n: &Expr, rows: &[f64], steady: bool, diagnostics: &mut Vec<Diagnostic>) -> Option<Thin> {
+    let interval = match equidistant(rows, steady, n.span) {
+        Ok(interval) => interval,
+        Err(error) => {
+            diagnostics.push(error);
+            return None;
+        }
+    };
+    let number = number(n, Dimension::NONE, diagnostics)?;
+    let most = rows.len() as f64;
+    if !(number >= 2.0 && number.fract() == 0.0 && number <= most) {
+        let error = Diagnostic::error("E0909", "`thin` keeps one of a whole number of rows, at least of 2");
+        diagnostics.push(error.label(n.span, format!("{number}")).help("write `thin(F - data.F, 10)`"));
+        return None;
+    }
+    let thin = Thin::new(number as usize, interval);
+    if rows.len() < thin.least().max(2 * thin.n) {
+        let least = thin.least().max(2 * thin.n);
+        let message = format!("`thin` needs {least} rows, and {} are compared", rows.len());
+        let error = Diagnostic::error("E0909", message).label(n.span, "too many for so few rows");
+        diagnostics.push(error.help("leave `thin` out"));
+        return None;
+    }
+    Some(thin)
+}
+
+fn items(
+    loaded: &Loaded,
+    parts: &Parts,
+    plot: &Plot,
+    (rows, steady): (&[f64], bool),
+    diagnostics: &mut Vec<Diagnostic>,
+) -> Vec<Item> {
     let mut series = plot.series.iter();
     let mut all = Vec::new();
-    for (of, sd) in &parts.items {
+    for Compared { of, sd, thin } in &parts.items {
         let difference = series.next().expect("each item is plotted");
         let sides = sides(of).map(|sides| {
             sides.map(|side| {
@@ -655,8 +713,15 @@ fn items(loaded: &Loaded, parts: &Parts, plot: &Plot, diagnostics: &mut Vec<Diag
                 None => continue,
             },
         };
+        let thin = match thin {
+            None => None,
+            Some(n) => match thinned(n, rows, steady, diagnostics) {
+                Some(thin) => Some(thin),
+                None => continue,
+            },
+        };
         let (slot, unit) = (difference.slot, difference.unit.clone());
-        all.push(Item { text: one_line(loaded, of.span), slot, unit, sd, sides });
+        all.push(Item { text: one_line(loaded, of.span), slot, unit, sd, thin, sides });
     }
     all
 }

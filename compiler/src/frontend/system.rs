@@ -444,6 +444,8 @@ pub struct Table {
     pub y_unit: Unit,
     /// Whether it interpolates by monotone cubics rather than linearly.
     pub smooth: bool,
+    /// Whether each value holds up to the next argument, rather than changing linearly.
+    pub held: bool,
     /// Arguments, in SI units.
     pub x: Vec<f64>,
     /// Values, in SI units.

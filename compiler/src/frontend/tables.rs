@@ -57,7 +57,15 @@ pub fn read(
         diagnostics.push(error.label(table.name.span, "at least one is needed"));
         return None;
     }
-    Some(Table { name: table.name.text.clone(), x_unit, y_unit, smooth: table.shape == TableShape::Smooth, x, y })
+    Some(Table {
+        name: table.name.text.clone(),
+        x_unit,
+        y_unit,
+        smooth: table.shape == TableShape::Smooth,
+        held: false,
+        x,
+        y,
+    })
 }
 
 /// Columns of a file of numbers, converted to SI, each with the unit it is shown in. The unit in the heading is that of

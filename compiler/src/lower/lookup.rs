@@ -34,7 +34,7 @@ impl Lookup {
 
     /// Appends a table with at least one point to the pool.
     fn place(table: &Table, pool: &mut Vec<f64>) -> Lookup {
-        let Table { x, y, smooth, .. } = table;
+        let Table { x, y, smooth, held, .. } = table;
         let n = x.len();
         let intervals = n - 1;
         let rows = intervals.next_power_of_two();
@@ -61,7 +61,7 @@ impl Lookup {
                 let (m0, m1) = (slopes[k] * width, slopes[k + 1] * width);
                 pool.extend([m0, 3.0 * rise - 2.0 * m0 - m1, m0 + m1 - 2.0 * rise, 0.0, 0.0]);
             } else {
-                pool.push(rise);
+                pool.push(if *held { 0.0 } else { rise });
             }
         }
         lookup
@@ -139,6 +139,10 @@ mod tests {
 
     /// A table of n points (k², (k − 2)³), read at x.
     fn read(n: usize, smooth: bool, x: f64) -> f64 {
+        read_of(n, (smooth, false), x)
+    }
+
+    fn read_of(n: usize, (smooth, held): (bool, bool), x: f64) -> f64 {
         let points = || (0..n).map(|k| k as f64);
         let dimension = Dimension::NONE;
         let table = Table {
@@ -146,6 +150,7 @@ mod tests {
             x_unit: Unit::si(dimension),
             y_unit: Unit::si(dimension),
             smooth,
+            held,
             x: points().map(|k| k * k).collect(),
             y: points().map(|k| (k - 2.0) * (k - 2.0) * (k - 2.0)).collect(),
         };
@@ -178,6 +183,19 @@ mod tests {
                     assert!((y(k - 1)..=y(k)).contains(&value), "it rises where the points do: {value} at {x} of {n}");
                 } else {
                     assert!((value - line).abs() < 1e-12, "a line between two points: {value} at {x} of {n}");
+                }
+            }
+        }
+    }
+    /// Mutants, each fails: a held table rises; it takes its next value.
+    #[test]
+    fn held_tables_keep_a_value_up_to_the_next_point() {
+        for n in 1..20 {
+            let y = |k: usize| (k as f64 - 2.0).powi(3);
+            for k in 0..n {
+                let (begin, end) = ((k * k) as f64, ((k + 1) * (k + 1)) as f64);
+                for x in [begin, 0.5 * (begin + end), end - 1e-9] {
+                    assert_eq!(read_of(n, (false, true), x), y(k), "at {x} of {n}");
                 }
             }
         }

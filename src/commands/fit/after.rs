@@ -338,9 +338,12 @@ pub fn held_out(runs: &Runs, found: &Found, settings: Settings) -> Option<Residu
         let values = restricted(runs, &answer.values, &free, settings, &mut run).ok()?.values;
         let all = runs.residuals(Way::Whole, &[values], steps).remove(0).ok()?;
         for (part, items) in runs.parts.iter().zip(runs.items()) {
-            for k in items {
-                for row in seen(part, 1 - half) {
-                    out[k][row] = all[k][row];
+            let is_unseen = seen(part, 1 - half);
+            for (k, item) in items.zip(&part.asks.items) {
+                for (at, row) in item.kept(&part.instants).into_iter().enumerate() {
+                    if is_unseen.binary_search(&row).is_ok() {
+                        out[k][at] = all[k][at];
+                    }
                 }
             }
         }
@@ -378,8 +381,11 @@ pub fn remarks(part: &Part, answer: &Answer, items: std::ops::Range<usize>) -> V
         names.push((name.clone(), unit.clone()));
         columns.push(rows.iter().map(|row| values[*row]).collect());
     }
-    let slices: Vec<&[f64]> = columns.iter().map(Vec::as_slice).collect();
-    let one = |k: usize| {
+    let one = |(k, item): (usize, &crate::compile::FitItem)| {
+        let kept = item.kept(&part.instants);
+        let columns: Vec<Vec<f64>> =
+            columns.iter().map(|column| kept.iter().map(|row| column[*row]).collect()).collect();
+        let slices: Vec<&[f64]> = columns.iter().map(Vec::as_slice).collect();
         let (residuals, noise) = (&answer.residuals[k], &answer.noise[k]);
         let white = noise.whitened(residuals);
         let found = with(|with| statistics::dependence(residuals, &white, &slices, with));
@@ -394,7 +400,12 @@ pub fn remarks(part: &Part, answer: &Answer, items: std::ops::Range<usize>) -> V
             found.rows.iter().all(|row| *row < head) && found.tenth.as_ref().is_none_or(|tenth| tenth.start == 0)
         };
         let outliers = statistics::outliers(residuals, &white).filter(|found| !(begins_badly && is_beginning(found)));
+        let of_rows = |found: Outliers| Outliers {
+            rows: found.rows.into_iter().map(|row| kept[row]).collect(),
+            tenth: found.tenth.map(|tenth| kept[tenth.start]..kept[tenth.end - 1] + 1),
+        };
+        let outliers = outliers.map(of_rows);
         Remarks { depends, outliers, begins_badly }
     };
-    items.map(one).collect()
+    items.zip(&part.asks.items).map(one).collect()
 }

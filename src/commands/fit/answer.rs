@@ -217,7 +217,7 @@ impl Fitted {
             }
             for (item, remarks) in part.asks.items.iter().zip(&run.remarks) {
                 if let Some((name, unit, found)) = &remarks.depends {
-                    let message = format!("what the model leaves of `{}`{of} depends on `{name}`", item.text);
+                    let message = format!("what the model leaves of `{}`{of} depends on `{name}`", item.shown());
                     let share = significant(100.0 * found.share, 2);
                     let label = format!("{share} % of its variance, most {}", class(found, unit));
                     let warning = Diagnostic::warning("W0903", message).label(runs.name, label);
@@ -226,7 +226,7 @@ impl Fitted {
                     )));
                 }
                 if remarks.outliers.is_some() {
-                    let message = format!("few rows hold most of the error of `{}`{of}", item.text);
+                    let message = format!("few rows hold most of the error of `{}`{of}", item.shown());
                     let alone = Remarks { outliers: remarks.outliers.clone(), ..Remarks::default() };
                     let warning = Diagnostic::warning("W0907", message).label(runs.name, said(&alone, part));
                     all.push((
@@ -235,7 +235,7 @@ impl Fitted {
                     ));
                 }
                 if remarks.begins_badly {
-                    let message = format!("the beginning of `{}`{of} fits far worse than the rest", item.text);
+                    let message = format!("the beginning of `{}`{of} fits far worse than the rest", item.shown());
                     let warning =
                         Diagnostic::warning("W0908", message).label(runs.name, "a state may have begun elsewhere");
                     all.push((
@@ -363,13 +363,13 @@ impl Fitted {
                     None => String::new(),
                 };
                 let rms = show(answer.rms[k], &item.unit, 4);
-                out += &format!("{indent}rms({})  {rms}, {colour}{of_given}\n", item.text);
+                out += &format!("{indent}rms({})  {rms}, {colour}{of_given}\n", item.shown());
             }
             out += &results::verdicts(terminal, &run.verdicts, None, None, indent);
         }
         for (one, judged) in self.judged.iter().zip(&runs.judged) {
             let items = judged.parts[0].asks.items.iter().zip(&one.residuals);
-            let each = items.map(|(item, rows)| format!("rms({})  {}", item.text, show(rms(rows), &item.unit, 4)));
+            let each = items.map(|(item, rows)| format!("rms({})  {}", item.shown(), show(rms(rows), &item.unit, 4)));
             let own = one.own.iter().map(|(label, value, unit)| format!("{label} {}", show(*value, unit, 4)));
             let all: Vec<String> = each.chain(own).collect();
             out += &format!("  validate {}: {}\n", one.label, all.join(", "));
@@ -466,7 +466,7 @@ impl Fitted {
             .collect();
         let compared = |(item, k): (&FitItem, usize)| {
             json!({
-                "text": item.text,
+                "text": item.shown(),
                 "rms": width(&item.unit, answer.rms[k]),
                 "given_sd": item.sd.map(|sd| width(&item.unit, sd)),
                 "unit": item.unit.text,
@@ -516,7 +516,7 @@ impl Fitted {
                     "unit": unit.text,
                 })).collect::<Vec<_>>(),
                 "compared": judged.parts[0].asks.items.iter().zip(&one.residuals).map(|(item, rows)| json!({
-                    "text": item.text,
+                    "text": item.shown(),
                     "rms": width(&item.unit, rms(rows)),
                     "unit": item.unit.text,
                     "rows": rows.len(),
@@ -611,7 +611,7 @@ pub fn as_written(runs: &Runs, residuals: &[Vec<f64>]) -> String {
         for (item, rows) in part.asks.items.iter().zip(&residuals[items]) {
             let rms = (rows.iter().map(|r| r * r).sum::<f64>() / rows.len().max(1) as f64).sqrt();
             let rows = count(rows.len() as u64);
-            out += &format!("  {of}rms({})  {}, {rows} rows\n", item.text, show(rms, &item.unit, 4));
+            out += &format!("  {of}rms({})  {}, {rows} rows\n", item.shown(), show(rms, &item.unit, 4));
         }
     }
     out

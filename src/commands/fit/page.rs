@@ -5,10 +5,10 @@
 use super::answer::{Fitted, said};
 use super::search::{Part, Runs};
 use crate::characterise::page::{escaped, page, words};
+use crate::compile::FitItem;
 use crate::figure::{self, Recorded};
 use crate::plot::{self, Axis, Curve, Figure, Look, Panel};
 use crate::quantity::{count, show, significant};
-use abi::unit::Unit;
 use grammar::diagnostic::Diagnostic;
 use runtime::record::Recording;
 use std::fmt::Write;
@@ -81,10 +81,10 @@ pub fn report(
         let _ = writeln!(body, "</div>\n<h2>Residuals{}</h2>\n<div class=\"tests\">", escaped(&of));
         for (item, k) in part.asks.items.iter().zip(items) {
             let rows = &fitted.answer.residuals[k];
-            for panel in residuals(part, &item.text, &item.unit, rows) {
+            for panel in residuals(part, item, rows) {
                 body += &draw(vec![panel], 1);
             }
-            body += &draw(vec![autocorrelation(&item.text, rows, &fitted.answer.noise[k].whitened(rows))], 1);
+            body += &draw(vec![autocorrelation(&item.shown(), rows, &fitted.answer.noise[k].whitened(rows))], 1);
         }
         body += "</div>\n";
     }
@@ -167,7 +167,7 @@ fn compared(fitted: &Fitted, runs: &Runs) -> String {
             let _ = writeln!(
                 out,
                 "<tr><td>{}</td><td class=\"n\">{}</td><td class=\"n\">{}</td><td>{noise}</td><td>{}</td></tr>",
-                escaped(&format!("{of}{}", item.text)),
+                escaped(&format!("{of}{}", item.shown())),
                 count(fitted.answer.residuals[k].len() as u64),
                 show(fitted.answer.rms[k], &item.unit, 4),
                 escaped(&said(remarks, part))
@@ -217,20 +217,22 @@ fn time_axis(part: &Part) -> Axis {
 }
 
 /// Residuals over time and over each column of the recording.
-fn residuals(part: &Part, text: &str, unit: &Unit, rows: &[f64]) -> Vec<Panel> {
-    let y = || Axis { name: text.into(), unit: unit.text.clone(), ..Axis::default() };
+fn residuals(part: &Part, item: &FitItem, rows: &[f64]) -> Vec<Panel> {
+    let (text, unit) = (&item.shown(), &item.unit);
+    let kept = item.kept(&part.instants);
+    let y = || Axis { name: text.clone(), unit: unit.text.clone(), ..Axis::default() };
     let (after, before) = part.asks.window;
     let compared: Vec<usize> =
         (0..part.asks.rows.len()).filter(|row| (after..=before).contains(&part.asks.rows[*row])).collect();
     let of = |x: Axis, at: &dyn Fn(usize) -> f64| {
         let points = thinned(rows.len()).map(|row| (at(row), unit.from_si(rows[row]) - unit.from_si(0.0))).collect();
-        let curve = Curve { name: text.into(), points, recorded: true, ..Curve::default() };
+        let curve = Curve { name: text.clone(), points, recorded: true, ..Curve::default() };
         Panel { x, y: y(), curves: vec![curve], legend: false, ..Panel::default() }
     };
-    let mut out = vec![of(time_axis(part), &|row| time(part, row))];
+    let mut out = vec![of(time_axis(part), &|row| time(part, kept[row]))];
     for (name, column, values) in &part.asks.columns {
         let x = Axis { name: name.clone(), unit: column.text.clone(), ..Axis::default() };
-        out.push(of(x, &|row| column.from_si(values[compared[row]])));
+        out.push(of(x, &|row| column.from_si(values[compared[kept[row]]])));
     }
     out
 }

@@ -223,7 +223,11 @@ impl Part {
                 let item = &self.asks.items[bad % width];
                 return Err(format!("`{}` is not a finite number", item.text));
             }
-            Ok((0..width).map(|k| values.iter().skip(k).step_by(width).copied().collect()).collect())
+            let of = |k: usize| {
+                let rows: Vec<f64> = values.iter().skip(k).step_by(width).copied().collect();
+                self.asks.items[k].thin.as_ref().map_or_else(|| rows.clone(), |thin| thin.of(instants, &rows))
+            };
+            Ok((0..width).map(of).collect())
         };
         let mut different: Vec<Vec<(Slot, f64)>> = Vec::new();
         let place = |values: &Vec<f64>| {

@@ -42,7 +42,7 @@ pub fn text(loaded: &Loaded, fit: &ast::Fit, fitted: &Fitted, runs: &Runs, place
         let asks = &part.asks;
         let rms = asks.items.iter().zip(&fitted.answer.rms[items]);
         let rms: Vec<String> =
-            rms.map(|(item, rms)| format!("rms({}) {}", item.text, show(*rms, &item.unit, 4))).collect();
+            rms.map(|(item, rms)| format!("rms({}) {}", item.shown(), show(*rms, &item.unit, 4))).collect();
         let rows = if asks.steady { "steady points" } else { "rows" };
         let data = project::relative(path, place.folder);
         let (all, rms) = (count(asks.rows.len() as u64), rms.join(", "));
@@ -193,6 +193,9 @@ fn experiment<'a>(
             FitStatement::Experiment(ExperimentStatement::Data(one)) => {
                 let columns = Span { start: one.columns[0].name.span.start, ..one.span };
                 let _ = writeln!(out, "data \"{data}\" ({}", slice(columns));
+            }
+            FitStatement::Experiment(ExperimentStatement::Derived(one)) => {
+                let _ = writeln!(out, "{}", slice(one.span));
             }
             FitStatement::Experiment(ExperimentStatement::Solver(one)) => solver = Some(slice(one.span).to_string()),
             FitStatement::Experiment(ExperimentStatement::Plot(one)) => {

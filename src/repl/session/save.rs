@@ -110,6 +110,7 @@ pub(super) fn statements(loaded: &Loaded, name: &str, duration: Option<f64>) -> 
             S::Solver(one) => one.span,
             S::Sweep(one) => one.span,
             S::Data(one) => one.span,
+            S::Derived(one) => one.span,
             S::Plot(one) => one.span,
             S::Tune(_, span) => *span,
             S::Expect(one) => one.span,

@@ -708,6 +708,13 @@ impl<'a> Flattener<'a> {
         if self.explained(function, env.file) {
             return;
         }
+        if function.text == "thin" {
+            let error = Diagnostic::error("E0901", "`thin` stands directly in an `rms` of `minimise`")
+                .label(function.span, "not here");
+            return self.report(
+                error.help("write `minimise rms(thin(F - data.F, 10))`; it takes a difference and a number of rows"),
+            );
+        }
         let mut error = Diagnostic::error("E0204", format!("there is no function `{}`", function.text))
             .label(function.span, "not declared");
         let loaded = self.loaded;
@@ -733,6 +740,9 @@ impl<'a> Flattener<'a> {
             "der" | "diff" | "ddt" => Some("a derivative is written `dz/dt`".to_string()),
             "sgn" | "signum" => Some(format!("write `sign({x})`")),
             "ln" => Some(format!("write `log({x})`: the natural logarithm")),
+            "smooth" | "filtfilt" | "lowpass" => Some(
+                "a filter makes a column of a recording: `let data.q = smooth(data.x, 60 Hz)` in an experiment or a fit".into(),
+            ),
             "log10" => Some(format!("write `log({x}) / log(10)`")),
             "pow" | "power" => Some(format!("write `({x})^({})`", given(1, "n"))),
             "sat" | "limit" | "saturate" | "saturation" => Some(format!(
