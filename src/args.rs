@@ -418,14 +418,21 @@ pub struct Test {
     pub timed: Timed,
 }
 
+/// Options that a plan contains.
+const PLANNED: [&str; 11] =
+    ["vary", "best", "runs", "seed", "all", "solver", "step", "tol", "duration", "shard", "resume"];
+/// Options of a sweep that runs.
+const RUNNING: [&str; 9] = ["out", "resume", "shard", "threads", "plot", "no_error", "interpret", "unit", "join"];
+
 /// `fric sweep`
 #[derive(clap::Args, Debug)]
 pub struct Sweep {
-    /// The text
+    /// The text; with --unit and --join the plan
     #[arg(value_hint = ValueHint::FilePath)]
     pub file: PathBuf,
-    /// The experiment in it to run
-    pub experiment: String,
+    /// The experiment in it to run; with --join the files of the units
+    #[arg(value_name = "EXPERIMENT", value_hint = ValueHint::AnyPath)]
+    pub rest: Vec<PathBuf>,
     /// What changes: 'fr.Fs = 1 N .. 2 N by 0.1 N', 'k = 1 N/m .. 100 N/m log 9', 'm = 1 kg, 2 kg'; 'fr.Fs = ±20 %' of its
     /// value, also 'lin 5'; 'x.k, y.k = 1 N/m, 2 N/m' together; 'fr = LuGre(), Dahl()' for a slot; 'fr.vs ~ lognormal(1 mm/s,
     /// 0.2)', also normal, uniform, '~ ±20 %'
@@ -440,15 +447,28 @@ pub struct Sweep {
     /// Seed of all random numbers [default: 1]
     #[arg(long, value_name = "NUMBER")]
     pub seed: Option<u64>,
-    /// The table to write: .csv or .parquet
-    #[arg(long, value_name = "FILE", default_value = "sweep.csv", value_hint = ValueHint::FilePath, value_parser = table)]
-    pub out: PathBuf,
+    /// The table to write: .csv or .parquet; without ending a dataset, a folder of Parquet files; with --unit any name
+    /// [default: sweep.csv, with --unit runs-A-B.fricunit]
+    #[arg(long, short, value_name = "FILE", value_hint = ValueHint::FilePath)]
+    pub out: Option<PathBuf>,
     /// Continue an unfinished table
     #[arg(long)]
     pub resume: bool,
     /// Compute one of N parts; the tables of all parts in order are that of the whole
     #[arg(long, value_name = "I/N", value_parser = shard)]
     pub shard: Option<(u64, u64)>,
+    /// Write the sweep as a plan, a file with all that it needs, and run nothing
+    #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath, conflicts_with_all = RUNNING)]
+    pub plan: Option<PathBuf>,
+    /// Run a part of a plan, on any machine: runs 0..1000, unit 2/8 of 8 from 0 on, or %j/8 in an array of tasks
+    #[arg(long, value_name = "A..B | J/N", conflicts_with_all = PLANNED, conflicts_with_all = ["join", "plan", "plot"])]
+    pub unit: Option<String>,
+    /// Join the units of a plan: the same bytes as the sweep on one machine
+    #[arg(long, conflicts_with_all = PLANNED, conflicts_with = "plan")]
+    pub join: bool,
+    /// Print the runs that no unit has, as ranges for --unit
+    #[arg(long, requires = "join")]
+    pub missing: bool,
     /// Threads [default: one for each core]
     #[arg(long, value_name = "N", value_parser = threads)]
     pub threads: Option<usize>,
@@ -1388,15 +1408,6 @@ fn shard(text: &str) -> Result<(u64, u64), String> {
     match read {
         Some((i, n)) if (1..=n).contains(&i) => Ok((i, n)),
         Some(_) | None => Err("write it as I/N, from 1/N to N/N".into()),
-    }
-}
-
-/// A name of a table.
-fn table(text: &str) -> Result<PathBuf, String> {
-    let path = PathBuf::from(text);
-    match path.extension().and_then(|extension| extension.to_str()) {
-        Some("csv" | "parquet") => Ok(path),
-        _ => Err("the name of a table ends in .csv or .parquet".into()),
     }
 }
 

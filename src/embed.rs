@@ -3,9 +3,12 @@
 //! In: a text and its name. Out: runs with the results of `fric run --json`, programs of models, reports on mistakes as
 //! strings. Files that a text names are read once, so that the text can be sent elsewhere together with them.
 
-use crate::compile::{self, Built, Case, Changes, Idle, Loaded, Options, Sources, Stages};
-use crate::disk::Disk;
+use crate::commands::sweep::{self, SweepFault, SweepRequest};
+pub use crate::commands::sweep::{Rows as SweepRows, Sent as Sweep};
+use crate::compile::{self, Built, Case, Changes, Idle, Loaded, Options, Stages};
 use crate::figure::{self, Kept};
+pub use crate::named_files::NamedFile;
+use crate::named_files::NamedFiles;
 use crate::plot::{self, Look};
 use crate::results::{self, Ran};
 use crate::{equations, project, report};
@@ -15,45 +18,7 @@ use grammar::diagnostic::Diagnostic;
 use runtime::engine::{self, Continue, Failure, Outcome, even_grid, sweep as runs};
 use runtime::record::Recording;
 use std::path::Path;
-use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Instant;
-
-/// A file that a text names: the name of that text, the path as written there, the name and the text of the file.
-pub type NamedFile = (String, String, String, String);
-
-/// The sources of a text: files that are given or were read before, then the disk.
-#[derive(Clone, Default)]
-struct NamedFiles(Arc<Mutex<Vec<NamedFile>>>);
-
-impl NamedFiles {
-    fn all(&self) -> Vec<NamedFile> {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner).clone()
-    }
-}
-
-impl Sources for NamedFiles {
-    fn library(&self, module: &str) -> Option<Vec<(String, String)>> {
-        Disk.library(module)
-    }
-
-    fn modules(&self) -> Vec<String> {
-        Disk.modules()
-    }
-
-    fn library_is_sound(&self) -> bool {
-        Disk.library_is_sound()
-    }
-
-    fn file(&self, from: &str, path: &str) -> Result<(String, String), String> {
-        let mut all = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some((_, _, name, text)) = all.iter().find(|file| file.0 == from && file.1 == path) {
-            return Ok((name.clone(), text.clone()));
-        }
-        let (name, text) = Disk.file(from, path)?;
-        all.push((from.into(), path.into(), name.clone(), text.clone()));
-        Ok((name, text))
-    }
-}
 
 /// What is wrong with a text or with what was asked of it.
 #[derive(Clone, Debug)]
@@ -187,7 +152,7 @@ impl Text {
     /// # Errors
     /// Mistakes of syntax and names.
     pub fn new(name: &str, text: &str, files: Vec<NamedFile>) -> Result<Text, Problems> {
-        let sources = NamedFiles(Arc::new(Mutex::new(files)));
+        let sources = NamedFiles::new(files);
         let loaded = compile::load(name, text, &sources);
         if loaded.diagnostics.iter().any(Diagnostic::is_error) {
             return Err(Problems::of(&loaded, &loaded.diagnostics));
@@ -290,6 +255,44 @@ impl Text {
             EndedRun { json, label: case.label.clone(), failure, case, result }
         };
         Ok(cases.into_iter().zip(results).map(run).collect())
+    }
+
+    /// The plan of a sweep of an experiment, as bytes that [`Sweep`] reads, here and elsewhere. `vary`: as for `--vary`.
+    ///
+    /// # Errors
+    /// The errors of the experiment and of what varies.
+    pub fn plan(
+        &self,
+        experiment: &str,
+        vary: &[String],
+        changes: &Changes,
+        runs: Option<u64>,
+        seed: Option<u64>,
+    ) -> Result<Vec<u8>, Problems> {
+        let mut loaded = self.loaded.clone();
+        let wrong = |report: String| Problems { report, ..Problems::of(&self.loaded, &[]) };
+        let vary = vary.iter().map(|text| crate::vary::parse(text).map_err(|why| format!("vary {text}: {why}")));
+        let Changes { set, method, step, tol, duration, .. } = changes.clone();
+        let request = SweepRequest {
+            experiment: experiment.into(),
+            vary: vary.collect::<Result<_, _>>().map_err(wrong)?,
+            set,
+            method,
+            step,
+            tol,
+            duration,
+            runs,
+            seed,
+            ..SweepRequest::default()
+        };
+        let (method, bytes) = sweep::planned(request, &mut loaded, &self.sources).map_err(|fault| match fault {
+            SweepFault::Misused(why) | SweepFault::Failed(why) => wrong(why),
+            SweepFault::Text(_, found) => Problems::of(&loaded, &found),
+        })?;
+        match without_effect(experiment, method, changes) {
+            Some(why) => Err(wrong(why)),
+            None => Ok(bytes),
+        }
     }
 
     /// A model on its own with its inputs open.

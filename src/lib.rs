@@ -25,6 +25,7 @@ mod project;
 mod source_snapshot;
 mod rig_log;
 mod disk;
+mod named_files;
 mod repl;
 mod terminal;
 mod timings;

@@ -119,6 +119,31 @@ pub fn columns(bytes: Vec<u8>) -> Result<Vec<(String, Vec<f64>)>, String> {
     Ok(columns.into_iter().filter_map(|(name, numbers)| Some((name, numbers?))).collect())
 }
 
+/// Passes the rows of a file that [`from_csv`] has written, with cells as text from which the same values are read.
+///
+/// # Errors
+/// Why it cannot be read, in words.
+pub fn rows(bytes: Vec<u8>, see: &mut dyn FnMut(&::csv::StringRecord)) -> Result<(), String> {
+    let told = |error: ParquetError| error.to_string();
+    let file = SerializedFileReader::new(::bytes::Bytes::from(bytes)).map_err(told)?;
+    let mut cells = ::csv::StringRecord::new();
+    for row in file.get_row_iter(None).map_err(told)? {
+        cells.clear();
+        for (_, field) in row.map_err(told)?.get_column_iter() {
+            match field {
+                Field::Null => cells.push_field(""),
+                Field::Bool(holds) => cells.push_field(&holds.to_string()),
+                Field::Long(x) => cells.push_field(&x.to_string()),
+                Field::Double(x) => cells.push_field(&format!("{x:?}")),
+                Field::Str(text) => cells.push_field(text),
+                other => return Err(format!("`{other}` is no cell of a sweep")),
+            }
+        }
+        see(&cells);
+    }
+    Ok(())
+}
+
 /// The number of a cell; none if it holds none.
 fn number(field: &Field) -> Option<f64> {
     Some(match *field {

@@ -14,6 +14,8 @@ const MOST_VALUES: usize = 10_000_000;
 /// One varied parameter.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Vary {
+    /// As written.
+    pub text: String,
     /// Its path; several that take the same values together are separated by commas: `x.k, y.k`.
     pub path: String,
     /// The unit of its values as written.
@@ -69,7 +71,7 @@ pub fn parse(text: &str) -> Result<Vary, String> {
     } else {
         listed(rest, EXAMPLES)?
     };
-    Ok(Vary { path: paths.join(", "), unit, how })
+    Ok(Vary { text: text.into(), path: paths.join(", "), unit, how })
 }
 
 /// `20 %`, `20 % lin 5`.
@@ -226,7 +228,7 @@ impl Vary {
             Some(count) => How::Values(spaced(count, -part, part, false).into_iter().map(at).collect()),
             None => How::Uniform(at(-part).min(at(part)), at(-part).max(at(part))),
         };
-        Vary { path: self.path.clone(), unit: unit.clone(), how }
+        Vary { text: self.text.clone(), path: self.path.clone(), unit: unit.clone(), how }
     }
 
     /// A typical value, to check whether the text compiles with it.

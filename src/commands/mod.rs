@@ -36,7 +36,7 @@ mod watch;
 mod repl;
 mod replay;
 mod run;
-mod sweep;
+pub mod sweep;
 mod fit;
 mod test;
 

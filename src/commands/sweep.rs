@@ -8,17 +8,29 @@
 mod best;
 mod errors;
 mod summary;
+mod request;
+mod plan;
+mod unit;
+mod sink;
+mod sent;
 
 use self::best::Best;
+use self::plan::Plan;
+use self::request::{Fault, Request};
+pub use self::request::{Fault as SweepFault, Request as SweepRequest};
+pub use self::sent::{Rows, Sent};
+use self::sink::{Before, Sink};
+use self::summary::Summary;
 use super::shared::progress;
-use super::{End, has_experiment, load, reported};
+use super::{End, has_experiment, load_from};
 use crate::args::Sweep;
-use crate::compile::{self, Changes, Loaded, Options, PreparedRun, Stopwatch, Varying};
-use crate::parquet::{self, Holds};
+use crate::compile::{Loaded, Method, PreparedRun, Stopwatch, Varying};
+use crate::named_files::NamedFiles;
+use crate::parquet::Holds;
 use crate::plot::{self, Axis};
 use crate::quantity::{self, count, significant};
 use crate::terminal::{Style, Terminal};
-use crate::unfinished::{Hash, Mark, Unfinished};
+use crate::unfinished::Hash;
 use crate::vary::{Dice, How, Vary};
 use crate::{project, results};
 use abi::plan::{Expect, Formula, Measure};
@@ -28,145 +40,241 @@ use runtime::engine::lanes::{self, Next};
 use runtime::engine::sweep::{self, Desk, Ticket};
 use runtime::engine::{self, Cause, Continue, Failure, Outcome};
 use runtime::run::verdict::Verdict;
-use std::fs::{self, File, OpenOptions};
-use std::io::{self, BufWriter, Write};
+use std::fs;
+use std::io;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 /// Draws of distributions if no number is given.
 const DEFAULT_RUNS: u64 = 100;
 
 pub fn sweep(args: &Sweep, terminal: &mut Terminal) -> End {
-    let Some(mut loaded) = load(&args.file, terminal, &mut Stopwatch::start("read")) else { return End::Failed };
-    let all: Vec<String> = loaded.experiments().into_iter().map(|experiment| experiment.name).collect();
-    if let Err(message) = has_experiment(&args.file, &args.experiment, &all) {
-        terminal.error(&message);
-        return End::Failed;
-    }
-    for (k, vary) in args.vary.iter().enumerate() {
-        let before = || args.vary[..k].iter().flat_map(Vary::paths);
-        if let Some(twice) = vary.paths().find(|path| before().any(|other| other == *path)) {
-            terminal.error(&format!("`{twice}` is varied twice; give it one --vary"));
-            return End::Misused;
-        }
-        let set = |wanted: &&str| args.changed.stepped.set.all.iter().any(|(path, _)| path == wanted);
-        if let Some(path) = vary.paths().find(set) {
-            terminal.error(&format!("`{path}` is both set and varied; leave out --set or --vary"));
-            return End::Misused;
-        }
-    }
-    let (models, numbers): (Vec<Vary>, Vec<Vary>) =
-        args.vary.iter().cloned().partition(|vary| matches!(vary.how, How::Models(_)));
-    let best = match best::read(&args.best) {
-        Ok(best) => best,
-        Err(message) => {
-            terminal.error(&message);
-            return End::Misused;
-        }
-    };
     if let Some(why) = args.look.unused(args.plot.is_some(), "--plot FIG.pdf") {
         terminal.error(&why);
         return End::Misused;
     }
-    let Some(cases) = compiled(args, &models, &numbers, best.as_ref(), &mut loaded, terminal) else {
-        return End::Failed;
+    let end = match &args.unit {
+        Some(which) => of_plan(args, terminal).and_then(|planned| planned.unit(args, which, terminal)),
+        None if args.join => of_plan(args, terminal).and_then(|planned| planned.join(args, terminal)),
+        None => of_text(args, terminal),
     };
-    let method = cases.first().map(|case| case.experiment.solver.method);
-    let (stepped, tol) = (&args.changed.stepped, args.changed.tol);
-    if let Some(why) = method.and_then(|method| stepped.without_effect_and(tol, &args.experiment, method)) {
-        terminal.error(&why);
-        return End::Misused;
-    }
-    if args.vary.is_empty() && cases.len() == 1 {
-        terminal.error(&format!(
-            "nothing varies: add --vary 'PATH = 1 N .. 2 N by 0.1 N', or a `sweep` to `{}`",
-            args.experiment
-        ));
-        return End::Misused;
-    }
-    let table = match SweepTable::new(args, numbers, cases, best) {
-        Ok(table) => table,
-        Err(message) => {
+    end.unwrap_or_else(|fault| match fault {
+        Fault::Misused(message) => {
             terminal.error(&message);
-            return End::Misused;
+            End::Misused
         }
-    };
-    match table.run(args, &loaded, terminal) {
-        Ok(end) => end,
-        Err(message) => {
+        Fault::Failed(message) => {
             terminal.error(&message);
             End::Failed
         }
-    }
-}
-
-/// The experiment with its parameters variable; a parameter that is computed from others, or has no value, is assigned
-/// one first.
-fn compiled(
-    args: &Sweep,
-    models: &[Vary],
-    numbers: &[Vary],
-    best: Option<&Best>,
-    loaded: &mut Loaded,
-    terminal: &Terminal,
-) -> Option<Vec<Varying>> {
-    // What rows are ranked by need not occur in the experiment.
-    let ranked = best.and_then(|best| best.measure.as_ref()).map(|measure| format!("show {measure}"));
-    // Models of a slot are compiled one by one, as those of a `sweep`.
-    let swept = models.iter().filter_map(|vary| match &vary.how {
-        How::Models(models) => Some(format!("sweep {} = {models}", vary.path)),
-        _ => None,
-    });
-    let also = ranked.into_iter().chain(swept);
-    let mut options = Options {
-        changes: Changes {
-            vary: numbers.iter().flat_map(Vary::paths).map(str::to_string).collect(),
-            also: also.collect(),
-            ..args.changed.changes()
-        },
-        interpret: args.interpret,
-    };
-    let name = &args.experiment;
-    let first = compile::varying(loaded, &crate::disk::Disk, name, &options, &mut Vec::new());
-    let open = |(_, path): &(&Vary, &str)| match &first {
-        Ok(cases) => cases.iter().any(|case| case.param(path).is_none()),
-        Err(_) => true,
-    };
-    let all = numbers.iter().flat_map(|vary| vary.paths().map(move |path| (vary, path)));
-    let missing: Vec<(&Vary, &str)> =
-        all.filter(|(vary, _)| !matches!(vary.how, How::Around(..))).filter(open).collect();
-    if missing.is_empty()
-        && let Ok(cases) = first
-    {
-        return Some(cases);
-    }
-    let shown = |(vary, path): (&Vary, &str)| {
-        let unit = Some(vary.unit.to_string()).filter(|unit| unit != "1").unwrap_or_default();
-        format!("{path}={} {unit}", vary.unit.from_si(vary.typical()))
-    };
-    options.changes.set.extend(missing.into_iter().map(shown));
-    match compile::varying(loaded, &crate::disk::Disk, name, &options, &mut Vec::new()) {
-        Ok(cases) => Some(cases),
-        Err(diagnostics) => {
-            reported(loaded, &diagnostics, terminal);
-            None
+        Fault::Text(message, _) => {
+            terminal.report(&message);
+            End::Failed
         }
+    })
+}
+
+/// The name of the table.
+fn table_name(args: &Sweep) -> Result<PathBuf, Fault> {
+    let out = args.out.clone().unwrap_or_else(|| "sweep.csv".into());
+    match out.extension().and_then(|extension| extension.to_str()) {
+        Some("csv" | "parquet") => Ok(out),
+        None if args.shard.is_none() => Ok(out),
+        None => Err(Fault::Misused(
+            "--shard is for tables: the files of a dataset are parts already; see --plan and --unit".into(),
+        )),
+        Some(_) => Err(Fault::Misused(format!(
+            "--out {}: the name of a table ends in .csv or .parquet, that of a dataset, a folder, has no ending",
+            out.display()
+        ))),
     }
 }
 
-/// The file to which rows are appended: the table itself, or one beside it if the format cannot grow row by row.
-fn rows_of(out: &Path) -> PathBuf {
-    match out.extension().is_some_and(|extension| extension == "parquet") {
-        true => out.with_file_name(format!(".{}.csv", name_of(out))),
-        false => out.to_path_buf(),
+/// The sweep of a text: run, or written as a plan.
+fn of_text(args: &Sweep, terminal: &mut Terminal) -> Result<End, Fault> {
+    let out = table_name(args)?;
+    let sources = NamedFiles::default();
+    let Some(mut loaded) = load_from(&args.file, &sources, terminal, &mut Stopwatch::start("read")) else {
+        return Ok(End::Failed);
+    };
+    let all: Vec<String> = loaded.experiments().into_iter().map(|experiment| experiment.name).collect();
+    let [name] = args.rest.as_slice() else {
+        let named = if args.rest.is_empty() { "name an experiment" } else { "name one experiment" };
+        return Err(Fault::Misused(format!("{named}: {} has {}", args.file.display(), all.join(", "))));
+    };
+    let name = name.to_string_lossy();
+    has_experiment(&args.file, &name, &all).map_err(Fault::Failed)?;
+    let table = request::table(Request::of(args, &name), &mut loaded, &sources, terminal.error_colour())?;
+    let (stepped, tol) = (&args.changed.stepped, args.changed.tol);
+    let method = table.cases[0].experiment.solver.method;
+    if let Some(why) = stepped.without_effect_and(tol, &name, method) {
+        return Err(Fault::Misused(why));
     }
+    let Some(path) = &args.plan else { return table.run(args, &out, &loaded, terminal).map_err(Fault::Failed) };
+    let root = loaded.files.get(loaded.root());
+    let bytes = plan::bytes(&table.request, &root.name, &root.text, &sources.all());
+    project::write(path, &bytes).map_err(|error| Fault::Failed(format!("cannot write {}: {error}", path.display())))?;
+    if !args.quiet {
+        terminal.line(&format!("wrote {}: {} runs of {name}", path.display(), count(table.total())));
+        terminal.line(&format!("  run a part:  fric sweep --unit 0/8 {}", path.display()));
+        terminal.line(&format!("  join all:    fric sweep --join {} *.fricunit --out sweep.csv", path.display()));
+    }
+    Ok(End::Fine)
+}
+
+/// The plan of a sweep as bytes, and the method of its first case.
+///
+/// # Errors
+/// Why it cannot be run.
+pub fn planned(request: Request, loaded: &mut Loaded, sources: &NamedFiles) -> Result<(Method, Vec<u8>), Fault> {
+    let table = request::table(request, loaded, sources, false)?;
+    let root = loaded.files.get(loaded.root());
+    let bytes = plan::bytes(&table.request, &root.name, &root.text, &sources.all());
+    Ok((table.cases[0].experiment.solver.method, bytes))
+}
+
+/// A sweep that was read from a plan.
+struct Planned {
+    /// The file of the plan, and its hash.
+    path: PathBuf,
+    hash: String,
+    loaded: Loaded,
+    table: SweepTable,
+}
+
+fn of_plan(args: &Sweep, terminal: &Terminal) -> Result<Planned, Fault> {
+    let path = args.file.clone();
+    let told = |why: String| Fault::Failed(format!("{} {why}", path.display()));
+    let bytes = fs::read(&path).map_err(|error| Fault::Failed(format!("cannot read {}: {error}", path.display())))?;
+    let Plan { mut request, hash, text } = plan::read(&bytes).map_err(told)?;
+    let (mut loaded, sources) = text.load();
+    request.interpret = args.interpret;
+    let table = request::table(request, &mut loaded, &sources, terminal.error_colour())?;
+    Ok(Planned { path, hash, loaded, table })
+}
+
+impl Planned {
+    /// Makes one unit. One that is there already, whole, is left as it is.
+    fn unit(self, args: &Sweep, which: &str, terminal: &mut Terminal) -> Result<End, Fault> {
+        if !args.rest.is_empty() {
+            return Err(Fault::Misused(
+                "--unit takes a plan and nothing more: fric sweep --unit 0/8 sweep.fricjob".into(),
+            ));
+        }
+        let Planned { hash, table, .. } = self;
+        let runs = unit::runs(which, table.total(), &|name| std::env::var(name).ok()).map_err(Fault::Misused)?;
+        let named = || PathBuf::from(format!("runs-{}-{}.fricunit", runs.start, runs.end));
+        let out = args.out.clone().unwrap_or_else(named);
+        let told = |error: io::Error| Fault::Failed(format!("cannot write {}: {error}", out.display()));
+        let head = unit::Head { plan: hash.clone(), runs: runs.clone() };
+        let size = runs.end - runs.start;
+        match unit::read_file(&out, &hash, &mut |_, _| Ok(())) {
+            Ok((found, _)) if found == runs => {
+                if !args.quiet {
+                    terminal.line(&format!("{} has its {} runs already", out.display(), count(size)));
+                }
+                return Ok(End::Fine);
+            }
+            // What only this command writes may be replaced.
+            Err(unit::Fault::Cut(found, _) | unit::Fault::Changed(found)) if found == head => {}
+            Err(unit::Fault::Unreadable(_)) if !out.exists() => {}
+            Ok(_) | Err(_) => {
+                return Err(Fault::Failed(format!(
+                    "{} is there, and it is not the unit of runs {}..{} of this plan: give this one another --out, or remove it",
+                    out.display(),
+                    runs.start,
+                    runs.end
+                )));
+            }
+        }
+        project::make_folder_of(&out).map_err(told)?;
+        let threads = threads(args);
+        let (dice, stopped, begin) = (table.dice(), stopped_by_ctrl_c(), Instant::now());
+        let rest = "{human_pos} of {human_len}  {per_sec}  {eta} left";
+        let bar = progress::bar(size, rest, args.quiet);
+        let written = unit::write(&out, &head, |put| {
+            let put = &mut |written: u64, row: &[u8]| {
+                if written.is_multiple_of(64) {
+                    bar.at(written);
+                }
+                put(row)
+            };
+            Ok(table.rows(runs.clone(), threads, &dice, &stopped, put)? == size)
+        });
+        bar.clear();
+        if written.map_err(told)?.is_none() {
+            terminal.report(&format!("stopped: {} is not written; a unit is whole or not there\n", out.display()));
+            return Ok(End::Failed);
+        }
+        if !args.quiet {
+            let wall = quantity::duration(begin.elapsed().as_secs_f64(), 3);
+            terminal.line(&format!("wrote {}: runs {}..{} in {wall}", out.display(), runs.start, runs.end));
+        }
+        Ok(End::Fine)
+    }
+
+    /// Joins units to the table of the whole.
+    fn join(self, args: &Sweep, terminal: &mut Terminal) -> Result<End, Fault> {
+        let Planned { path, hash, loaded, table } = self;
+        let out = table_name(args)?;
+        let (mut units, mut faults) = (Vec::new(), Vec::new());
+        for path in &args.rest {
+            match unit::read_file(path, &hash, &mut |_, _| Ok(())) {
+                Ok((runs, hash)) if runs.end <= table.total() => {
+                    units.push(unit::Found { path: path.clone(), runs, hash })
+                }
+                Ok((runs, _)) => faults.push((path, unit::Fault::Changed(unit::Head { plan: hash.clone(), runs }))),
+                Err(fault) => faults.push((path, fault)),
+            }
+        }
+        let faults: Vec<String> = faults.iter().map(|(unit, fault)| fault.words(unit, &path)).collect();
+        let cover = unit::cover(&units, table.total());
+        if args.missing {
+            faults.iter().for_each(|fault| terminal.error(fault));
+            cover.missing.iter().for_each(|runs| terminal.line(&format!("{}..{}", runs.start, runs.end)));
+            return Ok(End::Fine);
+        }
+        if !faults.is_empty() {
+            let (last, first) = faults.split_last().expect("there is one");
+            first.iter().for_each(|fault| terminal.error(fault));
+            return Err(Fault::Failed(last.clone()));
+        }
+        if let Some((a, b)) = cover.at_odds {
+            let [a, b] = [a, b].map(|k| units[k].path.display());
+            return Err(Fault::Failed(format!(
+                "{a} and {b} hold the same runs with different rows: one of them was changed after it was made; remove both and \
+                 make that unit again"
+            )));
+        }
+        if let Some(first) = cover.missing.first() {
+            let runs: u64 = cover.missing.iter().map(|runs| runs.end - runs.start).sum();
+            return Err(Fault::Failed(format!(
+                "{} of {} runs are in no unit, the first of them {}..{}: fric sweep --unit {}..{} {} makes them; --missing lists \
+                 all such ranges",
+                count(runs),
+                count(table.total()),
+                first.start,
+                first.end,
+                first.start,
+                first.end,
+                path.display()
+            )));
+        }
+        table.joined(args, &out, &loaded, (&units, &cover, &hash), terminal).map_err(Fault::Failed)
+    }
+}
+
+/// Threads of a sweep.
+fn threads(args: &Sweep) -> usize {
+    args.threads.unwrap_or_else(|| std::thread::available_parallelism().map_or(1, usize::from))
 }
 
 /// All runs of a sweep and the columns of its table.
 struct SweepTable {
+    request: Request,
     cases: Vec<Varying>,
     vary: Vec<Vary>,
     /// For each case, and each of what varies: the slots that take its values, each with a factor.
@@ -174,7 +282,6 @@ struct SweepTable {
     /// Combinations of the grids, and draws for each.
     grid: u64,
     draws: u64,
-    seed: u64,
     columns: Vec<Column>,
     /// The ranking of rows, with the column that ranks them.
     best: Option<(Best, usize)>,
@@ -224,13 +331,6 @@ fn placed(vary: Vary, cases: &[Varying], slots: &mut [Vec<Vec<(Slot, f64)>>]) ->
     }
     let percent = Unit::parse("%").expect("percent is known");
     Ok(vary.around(1.0, &percent))
-}
-
-/// The file to which rows are appended, and its checkpoint.
-struct Writing<'a> {
-    file: &'a mut File,
-    unfinished: &'a mut Unfinished,
-    mark: Mark,
 }
 
 /// A run of a sweep.
@@ -298,20 +398,20 @@ fn window(expect: &Expect, duration: f64) -> (f64, f64) {
 }
 
 impl SweepTable {
-    fn new(args: &Sweep, vary: Vec<Vary>, cases: Vec<Varying>, best: Option<Best>) -> Result<SweepTable, String> {
+    fn new(request: Request, vary: Vec<Vary>, cases: Vec<Varying>, best: Option<Best>) -> Result<SweepTable, String> {
         let mut slots: Vec<Vec<Vec<(Slot, f64)>>> = cases.iter().map(|_| Vec::new()).collect();
         let vary: Vec<Vary> =
             vary.into_iter().map(|vary| placed(vary, &cases, &mut slots)).collect::<Result<_, String>>()?;
         let grid = vary.iter().filter_map(Vary::len).map(|len| len as u64).product();
         let random = vary.iter().any(|vary| vary.len().is_none());
-        let draws = match (random, args.runs) {
+        let draws = match (random, request.runs) {
             (true, runs) => runs.unwrap_or(DEFAULT_RUNS),
             (false, None | Some(1)) => 1,
             (false, Some(_)) => {
                 return Err("--runs is for distributions, such as --vary 'm ~ normal(1 kg, 0.1 kg)'".into());
             }
         };
-        if !random && args.seed.is_some() {
+        if !random && request.seed.is_some() {
             return Err("--seed is for distributions, such as --vary 'm ~ normal(1 kg, 0.1 kg)'".into());
         }
         let columns = columns(&cases, &vary);
@@ -322,7 +422,16 @@ impl SweepTable {
             }
             None => None,
         };
-        Ok(SweepTable { cases, vary, slots, grid, draws, seed: args.seed.unwrap_or(1), columns, best })
+        Ok(SweepTable { request, cases, vary, slots, grid, draws, columns, best })
+    }
+
+    /// The random numbers of all runs.
+    fn dice(&self) -> Dice {
+        Dice::new(self.seed())
+    }
+
+    fn seed(&self) -> u64 {
+        self.request.seed.unwrap_or(1)
     }
 
     fn total(&self) -> u64 {
@@ -488,73 +597,32 @@ impl SweepTable {
         line(self.columns.iter().map(cell))
     }
 
-    fn run(&self, args: &Sweep, loaded: &Loaded, terminal: &mut Terminal) -> Result<End, String> {
+    /// Computes the rows, or those of a shard, and writes the table.
+    fn run(&self, args: &Sweep, out: &Path, loaded: &Loaded, terminal: &mut Terminal) -> Result<End, String> {
         let begin = Instant::now();
         let total = self.total();
         let (shard, shards) = args.shard.unwrap_or((1, 1));
         let part = |i: u64| (u128::from(total) * u128::from(i) / u128::from(shards)) as u64;
         let range = part(shard - 1)..part(shard);
-        // Only the first shard has a header, so that the concatenation of all is the whole.
-        let header = if shard == 1 { line(self.columns.iter().map(|column| column.title.clone())) } else { Vec::new() };
-        let asked = self.asked(args, loaded, &range);
-        let out = &args.out;
-        let rows = rows_of(out);
-        let told = |what: &str, error: io::Error| format!("cannot {what} {}: {error}", out.display());
-        project::make_folder_of(out).map_err(|error| told("write", error))?;
-        let mut unfinished = Unfinished::claim(out)?;
-        let before = unfinished.before().map(str::to_string);
-        let dice = Dice::new(self.seed);
-        let mut mark = Mark { rows: 0, bytes: 0, hash: Hash::EMPTY };
-        match (args.resume, &before) {
-            (true, Some(before)) if *before != asked.trim_end() => {
-                return Err(format!(
-                    "{} was begun with other settings or another text:\n{}now:\n{}give the same, or remove it",
-                    out.display(),
-                    indented(before),
-                    indented(&asked)
-                ));
+        let before = if args.resume { Before::Continue } else { Before::Nothing };
+        let asked = self.asked(loaded, &range);
+        let which = (range.clone(), shard == 1);
+        let mut sink = Sink::begin(self, out, which, asked, before, &mut |words| terminal.report(words))?;
+        let told = |error: io::Error| format!("cannot write {}: {error}", out.display());
+        let (stopped, threads) = (stopped_by_ctrl_c(), threads(args));
+        let rest = "{human_pos} of {human_len}  {per_sec}  {eta} left";
+        let bar = progress::bar(range.end - sink.next(), rest, args.quiet);
+        let written = self.rows(sink.next()..range.end, threads, &self.dice(), &stopped, &mut |before, row| {
+            if sink.row(self, row)? {
+                bar.at(before + 1);
             }
-            (true, Some(_)) => {
-                let fits = |k: u64, row: &str| self.is_row(range.start + k, row, &dice);
-                let sound = unfinished.sound(&rows, &header, &fits).map_err(|error| told("read", error))?;
-                mark = sound.mark;
-                if let Some(fault) = sound.fault {
-                    terminal.report(&format!(
-                        "{fault} of {} is missing or not as it was written: rows from {} on are computed again\n",
-                        rows.display(),
-                        range.start + mark.rows
-                    ));
-                }
-            }
-            (true, None) if out.exists() => {
-                return Err(format!("{} is complete or was not made by a sweep: nothing to resume", out.display()));
-            }
-            (false, Some(_)) if rows.exists() => {
-                return Err(format!(
-                    "{} holds a sweep that is not finished; go on with --resume, or remove it",
-                    out.display()
-                ));
-            }
-            (true | false, _) => {}
-        }
-        let mut file = if mark.rows > 0 {
-            OpenOptions::new().append(true).open(&rows).map_err(|error| told("write", error))?
-        } else {
-            unfinished.begin(&asked).map_err(|error| told("write", error))?;
-            let mut file = File::create(&rows).map_err(|error| told("write", error))?;
-            file.write_all(&header).map_err(|error| told("write", error))?;
-            mark = Mark { rows: 0, bytes: header.len() as u64, hash: Hash::EMPTY.and(&header) };
-            file
-        };
-        let threads = args.threads.unwrap_or_else(|| std::thread::available_parallelism().map_or(1, usize::from));
-        let from = range.start + mark.rows;
-        let into = Writing { file: &mut file, unfinished: &mut unfinished, mark };
-        let stopped = stopped_by_ctrl_c();
-        let written =
-            self.append(args, into, from..range.end, threads, &dice, &stopped).map_err(|error| told("write", error))?;
-        let reached = from + written;
-        let wall = begin.elapsed().as_secs_f64();
-        if reached < range.end {
+            Ok(())
+        });
+        bar.clear();
+        let written = written.map_err(told)?;
+        if sink.next() < range.end {
+            let (reached, rows) = (sink.next(), sink.rows());
+            sink.leave().map_err(told)?;
             terminal.report(&format!(
                 "stopped after {} of {} runs, which are kept in {}; go on with --resume\n",
                 count(reached - range.start),
@@ -563,37 +631,92 @@ impl SweepTable {
             ));
             return Ok(End::Failed);
         }
-        file.sync_all().map_err(|error| told("write", error))?;
-        let summary = self.summary(&rows, shard == 1).map_err(|error| told("read", error))?;
-        if rows != *out {
-            self.convert(&rows, shard == 1, out).map_err(|error| told("write", error))?;
+        let wall = begin.elapsed().as_secs_f64();
+        let how = format!(
+            "{} runs in {}, {} a second on {threads} thread{}",
+            count(written),
+            quantity::duration(wall, 3),
+            significant(written as f64 / wall, 3),
+            if threads == 1 { "" } else { "s" }
+        );
+        let summary = sink.finish(self)?;
+        self.settle(args, out, &summary, &range, &how, &stopped, terminal)
+    }
+
+    /// Writes the table from the rows of units.
+    fn joined(
+        &self,
+        args: &Sweep,
+        out: &Path,
+        loaded: &Loaded,
+        (units, cover, hash): (&[unit::Found], &unit::Cover, &str),
+        terminal: &mut Terminal,
+    ) -> Result<End, String> {
+        let range = 0..self.total();
+        let asked = self.asked(loaded, &range);
+        let which = (range.clone(), true);
+        // What this sweep itself has left there is written anew.
+        let mut sink = Sink::begin(self, out, which, asked, Before::Replace, &mut |_| ())?;
+        for (k, runs) in &cover.taken {
+            let path = &units[*k].path;
+            let mut failed = None;
+            let put = &mut |run: u64, row: &[u8]| {
+                if runs.contains(&run)
+                    && let Err(error) = sink.row(self, row)
+                {
+                    failed = Some(format!("cannot write {}: {error}", out.display()));
+                    return Err(io::ErrorKind::Other.into());
+                }
+                Ok(())
+            };
+            let read = unit::read_file(path, hash, put);
+            if let Some(failed) = failed {
+                return Err(failed);
+            }
+            if !matches!(&read, Ok((_, hash)) if *hash == units[*k].hash) {
+                return Err(format!("{} has changed while it was read: join again", path.display()));
+            }
         }
-        unfinished.finish();
+        let taken = cover.taken.len();
+        let s = if taken == 1 { "" } else { "s" };
+        let how = format!("{} runs from {} unit{s}", count(range.end), taken);
+        let summary = sink.finish(self)?;
+        self.settle(args, out, &summary, &range, &how, &stopped_by_ctrl_c(), terminal)
+    }
+
+    /// The first line of a table. Only the first shard has one, so that the concatenation of all is the whole.
+    fn header(&self, is_first: bool) -> Vec<u8> {
+        if is_first { line(self.columns.iter().map(|column| column.title.clone())) } else { Vec::new() }
+    }
+
+    /// What follows a complete table: its figure, summary and errors. `how`: how the rows came.
+    #[allow(clippy::too_many_arguments, reason = "both ways to the last row end here")]
+    fn settle(
+        &self,
+        args: &Sweep,
+        out: &Path,
+        summary: &Summary,
+        range: &Range<u64>,
+        how: &str,
+        stopped: &AtomicBool,
+        terminal: &mut Terminal,
+    ) -> Result<End, String> {
         if let Some(path) = &args.plot {
-            let figure = args.look.titled(self.figure(args, &summary)?);
+            let figure = args.look.titled(self.figure(args, summary)?);
             let kind = plot::Kind::of(path).unwrap_or(plot::Kind::Svg);
             let bytes = plot::picture(&figure, &args.look.look(), kind);
             project::write(path, &bytes).map_err(|error| format!("cannot write {}: {error}", path.display()))?;
         }
         if !args.quiet {
-            let speed = written as f64 / wall;
-            let heading = format!(
-                "{}, {}: {} runs in {}, {} a second on {} thread{}",
-                args.experiment,
-                results::solver(&self.cases[0].experiment.solver),
-                count(written),
-                quantity::duration(wall, 3),
-                significant(speed, 3),
-                threads,
-                if threads == 1 { "" } else { "s" }
-            );
+            let solver = results::solver(&self.cases[0].experiment.solver);
+            let heading = format!("{}, {solver}: {how}", self.request.experiment);
             terminal.line(&terminal.styled(Style::Bold, &heading));
             for note in self.cases.iter().flat_map(|case| &case.notes) {
                 terminal.line(&format!("  note: {note}"));
             }
             terminal.print(&summary.words(self));
             if !args.no_error {
-                match self.errors(&range, threads, &dice, &stopped) {
+                match self.errors(range, threads(args), &self.dice(), stopped) {
                     Some(errors) => terminal.print(&errors.words()),
                     None if stopped.load(Ordering::Relaxed) => {
                         terminal
@@ -635,68 +758,44 @@ impl SweepTable {
         })
     }
 
-    /// Appends rows; returns how many.
-    fn append(
+    /// Computes rows and passes each, with how many were passed before it, in order; returns how many.
+    fn rows(
         &self,
-        args: &Sweep,
-        into: Writing,
         range: Range<u64>,
         threads: usize,
         dice: &Dice,
         stopped: &AtomicBool,
+        put: &mut dyn FnMut(u64, &[u8]) -> io::Result<()>,
     ) -> io::Result<u64> {
-        let Writing { file, unfinished, mut mark } = into;
-        let rest = "{human_pos} of {human_len}  {per_sec}  {eta} left";
-        let bar = progress::bar(range.end - range.start, rest, args.quiet);
-        let mut writer = BufWriter::new(file);
         let (mut written, mut failed) = (0, None);
-        let mut flushed = Instant::now();
         let each = (range.end - range.start) / threads.max(1) as u64;
         let worker = |desk: &Desk<Vec<u8>>| self.work(desk, dice, stopped, each);
-        sweep::ordered(range, threads, &worker, &mut |_, row: Vec<u8>| {
-            let mut put = || {
-                writer.write_all(&row)?;
-                let Mark { rows, bytes, hash } = mark;
-                mark = Mark { rows: rows + 1, bytes: bytes + row.len() as u64, hash: hash.and(&row) };
-                if flushed.elapsed() > Duration::from_millis(200) {
-                    writer.flush()?;
-                    unfinished.note(mark)?;
-                    flushed = Instant::now();
-                    bar.at(written + 1);
-                }
-                Ok(())
-            };
-            match put() {
-                Ok(()) => {
-                    written += 1;
-                    Continue::Continue(())
-                }
-                Err(error) => {
-                    failed = Some(error);
-                    // Runs in progress need not finish.
-                    stopped.store(true, Ordering::Relaxed);
-                    Continue::Break(())
-                }
+        sweep::ordered(range, threads, &worker, &mut |_, row: Vec<u8>| match put(written, &row) {
+            Ok(()) => {
+                written += 1;
+                Continue::Continue(())
+            }
+            Err(error) => {
+                failed = Some(error);
+                // Runs in progress need not finish.
+                stopped.store(true, Ordering::Relaxed);
+                Continue::Break(())
             }
         });
-        bar.clear();
-        match failed {
-            Some(error) => Err(error),
-            None => writer.flush().map(|()| written),
-        }
+        failed.map_or(Ok(written), Err)
     }
 
     /// The request that a sweep must share with one that it resumes.
-    fn asked(&self, args: &Sweep, loaded: &Loaded, range: &Range<u64>) -> String {
+    fn asked(&self, loaded: &Loaded, range: &Range<u64>) -> String {
         let texts = loaded.files.0.iter().filter(|file| !file.name.starts_with("--"));
         let texts = texts.fold(Hash::EMPTY, |hash, file| hash.and(file.text.as_bytes()));
         let mut asked = format!("fric {}, texts {texts:016x}\n", env!("CARGO_PKG_VERSION"));
         let solver = results::solver(&self.cases[0].experiment.solver);
-        asked += &format!("{} with {solver} for {} s\n", args.experiment, self.cases[0].experiment.duration);
-        for vary in args.vary.iter().filter(|vary| matches!(vary.how, How::Models(_))) {
+        asked += &format!("{} with {solver} for {} s\n", self.request.experiment, self.cases[0].experiment.duration);
+        for vary in self.request.vary.iter().filter(|vary| matches!(vary.how, How::Models(_))) {
             asked += &format!("--vary {}: {:?}\n", vary.path, vary.how);
         }
-        for set in args.changed.stepped.set.texts() {
+        for set in &self.request.set {
             asked += &format!("--set {set}\n");
         }
         for vary in &self.vary {
@@ -708,28 +807,18 @@ impl SweepTable {
             };
             asked += &format!("--vary {} in {}: {how}\n", vary.path, vary.unit);
         }
-        asked + &format!("--seed {}, runs {}..{} of {}\n", self.seed, range.start, range.end, self.total())
+        asked + &format!("--seed {}, runs {}..{} of {}\n", self.seed(), range.start, range.end, self.total())
     }
 
-    /// Converts the rows to a Parquet file, after which they are no longer needed.
-    fn convert(&self, rows: &Path, header: bool, out: &Path) -> io::Result<()> {
+    /// The titles of the columns, and what their cells hold.
+    fn kinds(&self) -> Vec<(String, Holds)> {
         let holds = |column: &Column| match column.kind {
             ColumnKind::Run => Holds::Integers,
             ColumnKind::Case | ColumnKind::Status => Holds::Words,
             ColumnKind::Varied | ColumnKind::Measure | ColumnKind::Value => Holds::Numbers,
             ColumnKind::Verdict => Holds::Booleans,
         };
-        let columns: Vec<(String, Holds)> =
-            self.columns.iter().map(|column| (column.title.clone(), holds(column))).collect();
-        let part = out.with_file_name(format!(".{}.part", name_of(out)));
-        let written = File::create(&part)
-            .and_then(|to| parquet::from_csv(File::open(rows)?, header, &columns, to))
-            .and_then(|()| fs::rename(&part, out))
-            .and_then(|()| fs::remove_file(rows));
-        if written.is_err() {
-            let _ = fs::remove_file(&part);
-        }
-        written
+        self.columns.iter().map(|column| (column.title.clone(), holds(column))).collect()
     }
 }
 
@@ -836,12 +925,4 @@ fn line(cells: impl Iterator<Item = String>) -> Vec<u8> {
     let mut writer = csv::Writer::from_writer(Vec::new());
     writer.write_record(cells).expect("writing to memory does not fail");
     writer.into_inner().expect("writing to memory does not fail")
-}
-
-fn name_of(path: &Path) -> String {
-    path.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default()
-}
-
-fn indented(text: &str) -> String {
-    text.lines().map(|line| format!("  {line}\n")).collect()
 }

@@ -28,12 +28,22 @@ impl SweepTable {
     /// Reads the file once.
     pub(super) fn summary(&self, path: &Path, header: bool) -> io::Result<Summary> {
         let mut reader = csv::ReaderBuilder::new().has_headers(header).from_path(path).map_err(io::Error::other)?;
+        let mut summary = self.no_summary();
+        let mut record = csv::StringRecord::new();
+        while reader.read_record(&mut record).map_err(io::Error::other)? {
+            summary.see(&record);
+        }
+        Ok(summary)
+    }
+
+    /// The summary of no rows yet.
+    pub(super) fn no_summary(&self) -> Summary {
         let tallies = self.columns.iter().map(|column| Tally::new(&column.title, column.kind)).collect();
         let measured = self.columns.iter().filter(|column| column.kind.is_measured()).count() as u64;
         let points = self.grid * self.cases.len() as u64;
         let pointwise = self.draws > 1 && points > 1 && self.total().saturating_mul(measured) <= MOST_KEPT;
         let ranked = self.best.as_ref().filter(|_| !pointwise).map(|(best, column)| (best.clone(), *column));
-        let mut summary = Summary {
+        Summary {
             tallies,
             kept: Vec::new(),
             every: 1,
@@ -43,12 +53,7 @@ impl SweepTable {
             best: Vec::new(),
             draws: if pointwise { self.draws } else { 0 },
             points: BTreeMap::new(),
-        };
-        let mut record = csv::StringRecord::new();
-        while reader.read_record(&mut record).map_err(io::Error::other)? {
-            summary.see(&record);
         }
-        Ok(summary)
     }
 
     /// A measure over a parameter: the named ones, else the first parameter and every measure.
@@ -87,7 +92,7 @@ impl SweepTable {
             }
         };
         Ok(Figure {
-            title: args.experiment.clone(),
+            title: self.request.experiment.clone(),
             subtitle: format!("{} runs, {}", count(summary.rows), results::solver(&self.cases[0].experiment.solver)),
             panels: shown.into_iter().map(panel).collect(),
         })
@@ -193,7 +198,8 @@ impl Tally {
 }
 
 impl Summary {
-    fn see(&mut self, record: &csv::StringRecord) {
+    /// Adds the next row.
+    pub(super) fn see(&mut self, record: &csv::StringRecord) {
         let before: Vec<(f64, f64)> = self.tallies.iter().map(|tally| (tally.least, tally.most)).collect();
         let row: Vec<f64> = self.tallies.iter_mut().zip(record).map(|(tally, cell)| tally.see(cell)).collect();
         for (tally, before) in self.tallies.iter_mut().zip(before).filter(|(tally, _)| tally.kind.is_measured()) {

@@ -1,0 +1,314 @@
+//! Where the rows of a sweep go: a table, or a dataset, a folder of Parquet files.
+//!
+//! In: rows in the order of the runs. Out: files that are whole or marked as unfinished, with where to go on after an
+//! interruption. A table grows row by row. The files of a dataset are cut by the number of runs alone, so the bytes of
+//! each depend on its runs and not on who made it or when; each is written whole or not at all.
+
+use super::SweepTable;
+use super::summary::Summary;
+use crate::parquet;
+use crate::project;
+use crate::unfinished::{Hash, Mark, Unfinished};
+use serde_json::json;
+use std::fs::{self, File, OpenOptions};
+use std::io::{self, BufWriter, Write};
+use std::ops::Range;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+/// What may be there already.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub enum Before {
+    /// Nothing unfinished.
+    Nothing,
+    /// The begin of the same sweep, which is continued.
+    Continue,
+    /// The begin of the same sweep, which is written anew.
+    Replace,
+}
+
+/// The file to which rows are appended: the table itself, or one beside it if the format cannot grow row by row.
+pub fn rows_of(out: &Path) -> PathBuf {
+    match out.extension().is_some_and(|extension| extension == "parquet") {
+        true => out.with_file_name(format!(".{}.csv", name_of(out))),
+        false => out.to_path_buf(),
+    }
+}
+
+fn name_of(path: &Path) -> String {
+    path.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default()
+}
+
+fn indented(text: &str) -> String {
+    text.lines().map(|line| format!("  {line}\n")).collect()
+}
+
+/// Whether a name is that of a dataset: it has no ending, or ends with `/`.
+pub fn is_dataset(out: &Path) -> bool {
+    out.extension().is_none()
+}
+
+/// Rows of a file of a dataset: 65,536, or for fewer than 2^28 runs the power of two nearest above a 4096th of them, at
+/// least 256.
+pub fn rows_a_file(total: u64) -> u64 {
+    total.div_ceil(4096).next_power_of_two().clamp(256, 1 << 16)
+}
+
+/// The file of a dataset whose first run is this one.
+fn part(folder: &Path, first: u64) -> PathBuf {
+    folder.join(format!("part-{first:08}.parquet"))
+}
+
+/// The file that tells what a dataset is.
+const ABOUT: &str = "_fric.json";
+
+enum Form {
+    Table { writer: BufWriter<File>, mark: Mark },
+    Dataset { each: u64, rows: Vec<u8> },
+}
+
+/// A table or a dataset that is being written.
+pub struct Sink {
+    out: PathBuf,
+    /// Its runs, and the next one.
+    runs: Range<u64>,
+    next: u64,
+    has_header: bool,
+    asked: String,
+    unfinished: Unfinished,
+    form: Form,
+    noted: Instant,
+}
+
+impl Sink {
+    /// Begins or continues with the runs of a table. `is_first`: these begin the whole. `asked`: the request, which is
+    /// compared with that of an earlier begin. `warn` is called with damage that was found.
+    ///
+    /// # Errors
+    /// Why nothing is written, in words.
+    pub fn begin(
+        table: &SweepTable,
+        out: &Path,
+        (runs, is_first): (Range<u64>, bool),
+        asked: String,
+        before: Before,
+        warn: &mut dyn FnMut(&str),
+    ) -> Result<Sink, String> {
+        let told = |what: &str, error: io::Error| format!("cannot {what} {}: {error}", out.display());
+        let dataset = is_dataset(out);
+        if dataset && out.exists() && !out.is_dir() {
+            return Err(format!("{} is a file, and a name without ending is that of a folder of files", out.display()));
+        }
+        // The lock of a dataset lies inside.
+        let locked = if dataset { out.join(ABOUT) } else { out.to_path_buf() };
+        project::make_folder_of(&locked).map_err(|error| told("write", error))?;
+        let unfinished = Unfinished::claim(&locked)?;
+        let rows = if dataset { out.to_path_buf() } else { rows_of(out) };
+        let earlier = unfinished.before().map(str::to_string);
+        let is_same = earlier.as_deref().is_some_and(|earlier| earlier == asked.trim_end());
+        match (before, &earlier) {
+            (Before::Continue, Some(earlier)) if !is_same => {
+                return Err(format!(
+                    "{} was begun with other settings or another text:\n{}now:\n{}give the same, or remove it",
+                    out.display(),
+                    indented(earlier),
+                    indented(&asked)
+                ));
+            }
+            (Before::Continue, None) if locked.exists() => {
+                return Err(format!("{} is complete or was not made by a sweep: nothing to resume", out.display()));
+            }
+            (Before::Nothing | Before::Replace, Some(_))
+                if rows.exists() && !(before == Before::Replace && is_same) =>
+            {
+                return Err(format!(
+                    "{} holds a sweep that is not finished; go on with --resume, or remove it",
+                    out.display()
+                ));
+            }
+            _ => {}
+        }
+        let resumed = before == Before::Continue && is_same;
+        let header = table.header(is_first);
+        let empty = Form::Dataset { each: rows_a_file(table.total()), rows: Vec::new() };
+        let next = runs.start;
+        let mut sink = Sink {
+            out: out.into(),
+            runs,
+            next,
+            has_header: is_first,
+            asked,
+            unfinished,
+            form: empty,
+            noted: Instant::now(),
+        };
+        if dataset {
+            sink.begin_dataset(resumed).map_err(|error| told("write", error))?;
+            return Ok(sink);
+        }
+        if resumed {
+            let (first, dice) = (sink.runs.start, table.dice());
+            let fits = |k: u64, row: &str| table.is_row(first + k, row, &dice);
+            let sound = sink.unfinished.sound(&rows, &header, &fits).map_err(|error| told("read", error))?;
+            sink.next = first + sound.mark.rows;
+            if let Some(fault) = sound.fault {
+                warn(&format!(
+                    "{fault} of {} is missing or not as it was written: rows from {} on are computed again\n",
+                    rows.display(),
+                    sink.next
+                ));
+            }
+            if sound.mark.rows > 0 {
+                let file = OpenOptions::new().append(true).open(&rows).map_err(|error| told("write", error))?;
+                sink.form = Form::Table { writer: BufWriter::new(file), mark: sound.mark };
+                return Ok(sink);
+            }
+        }
+        let mut begin = || {
+            sink.unfinished.begin(&sink.asked)?;
+            let mut writer = BufWriter::new(File::create(&rows)?);
+            writer.write_all(&header)?;
+            let mark = Mark { rows: 0, bytes: header.len() as u64, hash: Hash::EMPTY.and(&header) };
+            sink.form = Form::Table { writer, mark };
+            Ok(())
+        };
+        begin().map_err(|error| told("write", error))?;
+        Ok(sink)
+    }
+
+    /// Finds the first file that is missing, or removes those of an older dataset.
+    fn begin_dataset(&mut self, resumed: bool) -> io::Result<()> {
+        let Form::Dataset { each, .. } = self.form else { return Ok(()) };
+        if resumed {
+            // A file has its name once it is whole.
+            while self.next < self.runs.end && part(&self.out, self.next).exists() {
+                self.next = (self.next + each).min(self.runs.end);
+            }
+            return Ok(());
+        }
+        for found in fs::read_dir(&self.out)? {
+            let path = found?.path();
+            let name = name_of(&path);
+            if (name.starts_with("part-") && name.ends_with(".parquet")) || name == ABOUT {
+                fs::remove_file(path)?;
+            }
+        }
+        let asked = self.asked.clone();
+        self.unfinished.begin(&asked)
+    }
+
+    /// The run whose row comes next.
+    pub fn next(&self) -> u64 {
+        self.next
+    }
+
+    /// The file with the rows so far.
+    pub fn rows(&self) -> PathBuf {
+        if is_dataset(&self.out) { self.out.clone() } else { rows_of(&self.out) }
+    }
+
+    /// Appends the row of the next run. Returns whether some time has passed since it last returned so.
+    pub fn row(&mut self, table: &SweepTable, row: &[u8]) -> io::Result<bool> {
+        self.next += 1;
+        let is_late = self.noted.elapsed() > Duration::from_millis(200);
+        match &mut self.form {
+            Form::Table { writer, mark } => {
+                writer.write_all(row)?;
+                let Mark { rows, bytes, hash } = *mark;
+                *mark = Mark { rows: rows + 1, bytes: bytes + row.len() as u64, hash: hash.and(row) };
+                if is_late {
+                    writer.flush()?;
+                    self.unfinished.note(*mark)?;
+                }
+            }
+            Form::Dataset { each, rows } => {
+                rows.extend_from_slice(row);
+                if self.next.is_multiple_of(*each) || self.next == self.runs.end {
+                    let first = (self.next - 1) / *each * *each;
+                    let mut bytes = Vec::new();
+                    parquet::from_csv(rows.as_slice(), false, &table.kinds(), &mut bytes)?;
+                    project::write(&part(&self.out, first), &bytes)?;
+                    rows.clear();
+                }
+            }
+        }
+        if is_late {
+            self.noted = Instant::now();
+        }
+        Ok(is_late)
+    }
+
+    /// Keeps what has come, for a later begin.
+    pub fn leave(mut self) -> io::Result<()> {
+        match &mut self.form {
+            Form::Table { writer, mark } => {
+                writer.flush()?;
+                self.unfinished.note(*mark)
+            }
+            Form::Dataset { .. } => Ok(()),
+        }
+    }
+
+    /// After the last row: gives the table its name, and reads it once.
+    ///
+    /// # Errors
+    /// What cannot be read or written, in words.
+    pub fn finish(mut self, table: &SweepTable) -> Result<Summary, String> {
+        assert_eq!(self.next, self.runs.end, "not all rows have come");
+        let told = |what: &str, error: io::Error| format!("cannot {what} {}: {error}", self.out.display());
+        let summary = match &mut self.form {
+            Form::Table { writer, .. } => {
+                writer.flush().map_err(|error| told("write", error))?;
+                writer.get_ref().sync_all().map_err(|error| told("write", error))?;
+                let rows = rows_of(&self.out);
+                let summary = table.summary(&rows, self.has_header).map_err(|error| told("read", error))?;
+                if rows != self.out {
+                    convert(table, &rows, self.has_header, &self.out).map_err(|error| told("write", error))?;
+                }
+                summary
+            }
+            Form::Dataset { each, .. } => {
+                let each = *each;
+                let mut summary = table.no_summary();
+                for first in (0..self.runs.end).step_by(each as usize) {
+                    let path = part(&self.out, first);
+                    let bytes = fs::read(&path).map_err(|error| format!("cannot read {}: {error}", path.display()))?;
+                    parquet::rows(bytes, &mut |cells| summary.see(cells))
+                        .map_err(|error| format!("cannot read {}: {error}", path.display()))?;
+                }
+                let about = json!({
+                    "asked": self.asked.lines().collect::<Vec<_>>(),
+                    "runs": self.runs.end,
+                    "rows a file": each,
+                    "columns": table.kinds().into_iter().map(|(title, _)| title).collect::<Vec<_>>(),
+                });
+                let about = format!("{about:#}\n");
+                project::write(&self.out.join(ABOUT), about.as_bytes()).map_err(|error| told("write", error))?;
+                summary
+            }
+        };
+        self.unfinished.finish();
+        Ok(summary)
+    }
+}
+
+/// Converts the rows to a Parquet file, after which they are no longer needed.
+fn convert(table: &SweepTable, rows: &Path, has_header: bool, out: &Path) -> io::Result<()> {
+    let part = out.with_file_name(format!(".{}.part", name_of(out)));
+    let written = File::create(&part)
+        .and_then(|to| parquet::from_csv(File::open(rows)?, has_header, &table.kinds(), to))
+        .and_then(|()| fs::rename(&part, out))
+        .and_then(|()| fs::remove_file(rows));
+    if written.is_err() {
+        let _ = fs::remove_file(&part);
+    }
+    written
+}
+
+#[test]
+fn files_of_a_dataset_are_cut_by_the_number_of_runs() {
+    assert_eq!(
+        [1, 256, 1 << 20, (1 << 20) + 1, 10_000_000, 1 << 28, 1 << 40].map(rows_a_file),
+        [256, 256, 256, 512, 4096, 65_536, 65_536]
+    );
+}

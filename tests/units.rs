@@ -1,0 +1,407 @@
+//! A sweep cut into units and joined has the bytes of the sweep on one machine: for generated sweeps of all kinds, and
+//! random cuts, orders, repetitions and killed units. `FRIC_SEED`, `FRIC_RUNS` (default 10 sweeps).
+
+mod support;
+
+use runtime::rng::Chance;
+use std::fs;
+use std::ops::Range;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output, Stdio};
+use std::time::Duration;
+use support::number;
+
+/// Some values of c make x leave its range, some of k break what is required, some of m their range.
+const TEXT: &str = r#"
+model Spring {
+  input  push [N] = 0 N
+  param  k = 20 N/m in > 0
+  param  k2 = 1 N/m
+  param  c = 0.5 N·s/m
+  param  m = 1 kg in 0.5 kg .. 3 kg
+  state  x [m]   = 0.1 m in -1 m .. 1 m
+  state  v [m/s] = 0
+  require k < 80 N/m
+  dx/dt = v
+  dv/dt = (push - (k + k2) * x - c * v) / m
+}
+experiment fixed {
+  run    Spring() for 1 s
+  solver euler step 1 ms
+  expect max(x) < 0.2 m
+  expect max(x) - min(x) < 0.19 m
+  expect max(v) > 0.1 m/s after 0.2 s
+}
+experiment adaptive {
+  run    Spring() for 1 s
+  expect rms(v) < 0.4 m/s
+  show   final(x) * 2 [mm]
+}
+experiment cases {
+  run    Spring() for 0.5 s
+  solver rk4 step 2 ms
+  sweep  k2 = 1 N/m, 30 N/m
+  expect min(x) < 0 m
+}
+experiment recorded {
+  run    Spring(push = data.u) for 1 s
+  data   "push.csv" (t [s], u [N])
+  solver euler step 1 ms
+  expect max(abs(x)) < 0.15 m
+}
+"#;
+
+/// What may vary, at most one of each line at once.
+const VARIED: [&[&str]; 4] = [
+    &["k = 10 N/m .. 90 N/m by 20 N/m", "k = ±20 % lin 4", "k ~ lognormal(40 N/m, 0.5)", "k = 5 N/m .. 50 N/m log 3"],
+    &["c = -9 N·s/m, 0.5 N·s/m", "c ~ uniform(-9 N·s/m, 2 N·s/m)"],
+    &["m ~ normal(1 kg, 0.4 kg)", "m = 0.4 kg, 1 kg, 3.5 kg", "m ~ ±60 %"],
+    &["v = -1 m/s .. 1 m/s lin 3", "x = 0.1 m, 2 m"],
+];
+
+/// One after the other: each uses all that the machine has, and the folder of the test.
+fn folder(name: &str) -> PathBuf {
+    let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).join(format!("units-{name}"));
+    let _ = fs::remove_dir_all(&folder);
+    fs::create_dir_all(&folder).unwrap();
+    folder
+}
+
+fn fric(folder: &Path, args: &[&str]) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_fric"));
+    command.current_dir(folder).args(args).stdin(Stdio::null()).env_remove("SLURM_ARRAY_TASK_ID");
+    command.env_remove("JOB_COMPLETION_INDEX");
+    command
+}
+
+#[track_caller]
+fn run(folder: &Path, args: &[&str], code: i32) -> (String, String) {
+    let Output { status, stdout, stderr } = fric(folder, args).output().unwrap();
+    let (out, err) = (String::from_utf8(stdout).unwrap(), String::from_utf8(stderr).unwrap());
+    assert_eq!(status.code(), Some(code), "{args:?}\n{out}\n{err}");
+    (out, err)
+}
+
+fn texts(folder: &Path) {
+    fs::write(folder.join("spring.fric"), TEXT).unwrap();
+    fs::write(folder.join("push.csv"), "t [s];u [N]\n0;0\n0.3;2\n0.6;-1\n1;0\n").unwrap();
+}
+
+/// The options of a random sweep: an experiment, what varies, how often it is drawn, and what is set.
+fn random_sweep(chance: &mut Chance) -> Vec<String> {
+    let experiment = ["fixed", "adaptive", "cases", "recorded"][chance.below(4) as usize];
+    let mut options = vec![experiment.to_string()];
+    let mut drawn = false;
+    let (mut varied, joint) = (0, chance.below(5) == 0 && experiment != "cases");
+    for (k, line) in VARIED.iter().enumerate() {
+        if (joint && k == 0) || chance.below(2) == 0 {
+            continue;
+        }
+        let vary = line[chance.below(line.len() as u64) as usize];
+        options.extend(["--vary".into(), vary.into()]);
+        drawn |= vary.contains('~');
+        varied += 1;
+    }
+    if joint || (varied == 0 && experiment != "cases") {
+        options.extend(["--vary".into(), "k, k2 = 5 N/m, 20 N/m, 85 N/m".into()]);
+    }
+    if drawn {
+        options.extend(["--runs".into(), (1 + chance.below(40)).to_string(), "--seed".into()]);
+        options.push(chance.below(1000).to_string());
+    }
+    if chance.below(4) == 0 {
+        options.extend(["--best".into(), "3 by max(x)".into()]);
+    }
+    if chance.below(4) == 0 {
+        options.extend(["--for".into(), "0.7 s".into()]);
+    }
+    options
+}
+
+fn rows_of(table: &Path) -> u64 {
+    fs::read(table).unwrap().iter().filter(|byte| **byte == b'\n').count() as u64 - 1
+}
+
+/// Random runs that cover all, some of them several times, in random order.
+fn random_units(chance: &mut Chance, total: u64) -> Vec<Range<u64>> {
+    let mut ends: Vec<u64> = (0..chance.below(4)).map(|_| chance.below(total + 1)).chain([0, total]).collect();
+    ends.sort_unstable();
+    let mut units: Vec<Range<u64>> = ends.windows(2).map(|pair| pair[0]..pair[1]).collect();
+    for _ in 0..chance.below(3) {
+        let ends = [chance.below(total + 1), chance.below(total + 1)];
+        units.push(ends[0].min(ends[1])..ends[0].max(ends[1]));
+    }
+    for k in (1..units.len()).rev() {
+        units.swap(k, chance.below(k as u64 + 1) as usize);
+    }
+    units
+}
+
+/// Names and bytes of the files of a folder.
+fn files(folder: &Path) -> Vec<(String, Vec<u8>)> {
+    let found = fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path());
+    let mut files: Vec<(String, Vec<u8>)> =
+        found.map(|path| (path.file_name().unwrap().to_string_lossy().into_owned(), fs::read(path).unwrap())).collect();
+    files.sort();
+    files
+}
+
+#[test]
+fn units_joined_have_the_bytes_of_one_machine() {
+    let seed = number("FRIC_SEED").unwrap_or(1);
+    let (mut failed, mut killed, mut units_made) = (0, 0, 0);
+    let sweeps = number("FRIC_RUNS").unwrap_or(10);
+    let mut joined_sets = Vec::new();
+    for k in 0..sweeps {
+        let mut chance = Chance(seed.wrapping_mul(1000) + k);
+        let folder = folder(&format!("generated-{k}"));
+        texts(&folder);
+        let options = random_sweep(&mut chance);
+        println!("seed {seed}, sweep {k}: {options:?}");
+        let options: Vec<&str> = options.iter().map(String::as_str).collect();
+        let sweep = |more: &[&'static str]| [&["sweep", "spring.fric"], &options[..], more].concat();
+        run(&folder, &sweep(&["-q", "--threads", "1", "--out", "one.csv"]), 0);
+        run(&folder, &sweep(&["-q", "--plan", "plan.fricjob"]), 0);
+        let one = fs::read(folder.join("one.csv")).unwrap();
+        let total = rows_of(&folder.join("one.csv"));
+        failed += String::from_utf8(one.clone()).unwrap().lines().filter(|row| !row.ends_with(",ok")).count() - 1;
+        // A plan needs nothing else: another folder, and the text gone.
+        let elsewhere = folder.join("elsewhere");
+        fs::create_dir(&elsewhere).unwrap();
+        fs::rename(folder.join("plan.fricjob"), elsewhere.join("plan.fricjob")).unwrap();
+        fs::remove_file(folder.join("spring.fric")).unwrap();
+        fs::remove_file(folder.join("push.csv")).unwrap();
+        let units = random_units(&mut chance, total);
+        let names: Vec<String> = (0..units.len()).map(|k| format!("{k}.fricunit")).collect();
+        for (unit, name) in units.iter().zip(&names) {
+            let runs = format!("{}..{}", unit.start, unit.end);
+            let threads = (1 + chance.below(3)).to_string();
+            let mut args = vec!["sweep", "--unit", &runs, "plan.fricjob", "-o", name, "-q", "--threads", &threads];
+            args.extend((chance.below(3) == 0).then_some("--interpret"));
+            if chance.below(2) == 0 {
+                let mut child = fric(&elsewhere, &args).spawn().unwrap();
+                std::thread::sleep(Duration::from_micros(chance.below(150_000)));
+                child.kill().unwrap();
+                child.wait().unwrap();
+                killed += usize::from(!elsewhere.join(name).exists());
+            }
+            run(&elsewhere, &args, 0);
+            units_made += 1;
+            if chance.below(3) == 0 {
+                // Again: it is there already.
+                let made = fs::metadata(elsewhere.join(name)).unwrap().modified().unwrap();
+                run(&elsewhere, &args, 0);
+                assert_eq!(fs::metadata(elsewhere.join(name)).unwrap().modified().unwrap(), made);
+            }
+        }
+        let names: Vec<&str> = names.iter().map(String::as_str).collect();
+        fn join<'a>(parts: &[&'a str], more: &[&'a str]) -> Vec<&'a str> {
+            [&["sweep", "--join", "plan.fricjob"], parts, more].concat()
+        }
+        run(&elsewhere, &join(&names, &["-q", "--out", "joined.csv"]), 0);
+        assert!(fs::read(elsewhere.join("joined.csv")).unwrap() == one, "{options:?} {units:?}");
+        run(&elsewhere, &join(&names, &["-q", "--out", "set"]), 0);
+        joined_sets.push((options.iter().map(|one| one.to_string()).collect::<Vec<_>>(), elsewhere.join("set")));
+        // Without one of them: its runs, unless others hold them.
+        let left_out = chance.below(names.len() as u64) as usize;
+        let others = |k: usize| units.iter().enumerate().any(|(at, unit)| at != left_out && unit.contains(&(k as u64)));
+        let rest: Vec<&str> = (0..names.len()).filter(|k| *k != left_out).map(|k| names[k]).collect();
+        let (out, _) = run(&elsewhere, &join(&rest, &["--missing"]), 0);
+        let mut missing = vec![false; total as usize];
+        for line in out.lines() {
+            let (start, end) = line.split_once("..").unwrap();
+            missing[start.parse().unwrap()..end.parse().unwrap()].fill(true);
+        }
+        assert!((0..total as usize).all(|k| missing[k] != others(k)), "{units:?} without {left_out}: {out}");
+    }
+    // A dataset has the same files, whoever makes it.
+    for (options, joined) in joined_sets {
+        let folder = folder("set");
+        texts(&folder);
+        let options: Vec<&str> = options.iter().map(String::as_str).collect();
+        run(&folder, &[&["sweep", "spring.fric"], &options[..], &["-q", "--out", "set/"]].concat(), 0);
+        assert!(files(&folder.join("set")) == files(&joined), "{options:?}");
+    }
+    println!("{units_made} units, {killed} killed before they were written; {failed} runs failed");
+    assert!(sweeps < 10 || (failed > 20 && killed > 0), "{failed} failed runs, {killed} killed units");
+}
+
+/// Joined to Parquet, with plot and summary; and everything that is refused says why, and leaves a table as it was.
+#[test]
+fn what_is_no_unit_of_the_plan_is_refused() {
+    let folder = folder("refused");
+    texts(&folder);
+    let sweep = ["sweep", "spring.fric", "fixed", "--vary", "k = 10 N/m .. 60 N/m lin 30"];
+    let with = |more: &[&'static str]| [&sweep[..], more].concat();
+    run(&folder, &with(&["-q", "--out", "one.parquet", "--plot", "one.svg"]), 0);
+    let (whole, _) = run(&folder, &with(&["--out", "one.csv"]), 0);
+    let (out, _) = run(&folder, &with(&["--plan", "p.fricjob"]), 0);
+    assert!(out.contains("wrote p.fricjob: 30 runs of fixed"), "{out}");
+    let (again, _) = run(&folder, &with(&["--plan", "p2.fricjob", "--set", "c=0.6 N·s/m"]), 0);
+    assert!(again.contains("30 runs"));
+    let unit = |which: &'static str, plan: &'static str, out: &'static str, code| {
+        run(&folder, &["sweep", "--unit", which, plan, "--out", out], code)
+    };
+    let (out, _) = unit("0/2", "p.fricjob", "a", 0);
+    assert!(out.contains("wrote a: runs 0..15 in"), "{out}");
+    unit("1/2", "p.fricjob", "b", 0);
+    unit("1/2", "p2.fricjob", "foreign", 0);
+    let join = |parts: &[&'static str], code| {
+        run(&folder, &[&["sweep", "--join", "p.fricjob"], parts, &["--out", "t.csv"]].concat(), code)
+    };
+    fs::write(folder.join("t.csv"), "kept").unwrap();
+    let bytes = fs::read(folder.join("b")).unwrap();
+    fs::write(folder.join("cut"), &bytes[..bytes.len() / 2]).unwrap();
+    let changed = String::from_utf8(bytes.clone()).unwrap().replacen(",ok", ",OK", 1);
+    fs::write(folder.join("changed"), changed).unwrap();
+    for (parts, words) in [
+        (&["a"][..], "15 of 30 runs are in no unit, the first of them 15..30: fric sweep --unit 15..30 p.fricjob"),
+        (&["a", "foreign"], "foreign is a unit of another plan"),
+        (&["a", "cut"], "rows; remove it and make it again: fric sweep --unit 15..30 p.fricjob --out cut"),
+        (&["a", "changed"], "changed is not as it was written"),
+        (&["a", "b", "spring.fric"], "spring.fric is no unit of a sweep"),
+        (&["a", "b", "nowhere"], "cannot read nowhere"),
+        (&["a", "p.fricjob"], "p.fricjob is no unit of a sweep"),
+    ] {
+        let (_, err) = join(parts, 1);
+        assert!(err.contains(words), "{parts:?}: {err}");
+    }
+    assert_eq!(fs::read(folder.join("t.csv")).unwrap(), b"kept");
+    // What is not this unit is not overwritten; a unit that was cut off is made again.
+    for name in ["a", "foreign", "spring.fric"] {
+        let (_, err) = unit("1/2", "p.fricjob", name, 1);
+        assert!(err.contains("it is not the unit of runs 15..30"), "{name}: {err}");
+    }
+    for name in ["cut", "changed"] {
+        unit("1/2", "p.fricjob", name, 0);
+        assert!(fs::read(folder.join(name)).unwrap() == bytes, "{name}");
+    }
+    let (out, _) = unit("1/2", "p.fricjob", "b", 0);
+    assert!(out.contains("has its 15 runs already"), "{out}");
+    // The same words as after the sweep itself, but for its speed and its name.
+    let (joined, _) = join(&["b", "a", "cut"], 0);
+    let rest = |text: &str| text.lines().skip(1).map(|line| line.replace("one.csv", "t.csv")).collect::<Vec<_>>();
+    assert_eq!(rest(&joined), rest(&whole));
+    assert!(joined.starts_with("fixed, euler step 1 ms: 30 runs from 2 units"), "{joined}");
+    let to = ["sweep", "--join", "p.fricjob", "a", "b", "-q", "-o", "t.parquet", "--plot", "t.svg"];
+    run(&folder, &to, 0);
+    for (one, other) in [("one.parquet", "t.parquet"), ("one.svg", "t.svg")] {
+        assert!(fs::read(folder.join(one)).unwrap() == fs::read(folder.join(other)).unwrap(), "{one}");
+    }
+    // Options that the plan holds, and those that mean nothing here.
+    for (args, code, words) in [
+        ("sweep --unit 0/2 p.fricjob --seed 3", 2, "cannot be used with"),
+        ("sweep --unit 2/2 p.fricjob", 2, "numbered from 0/2 to 1/2"),
+        ("sweep --unit 0..31 p.fricjob", 2, "the plan has 30 runs"),
+        ("sweep --unit %j/2 p.fricjob", 2, "neither SLURM_ARRAY_TASK_ID nor JOB_COMPLETION_INDEX"),
+        ("sweep --unit 0/2 spring.fric", 1, "spring.fric is no whole plan of a sweep"),
+        ("sweep --unit 0/2 nowhere", 1, "cannot read nowhere"),
+        ("sweep --missing p.fricjob", 2, "--join"),
+        ("sweep --join p.fricjob a --set k=2N/m", 2, "cannot be used with"),
+        ("sweep --join p.fricjob a b --out t.txt", 2, "ends in .csv or .parquet"),
+        ("sweep spring.fric", 2, "has fixed, adaptive, cases, recorded"),
+        ("sweep spring.fric fixed --plan q --plot q.svg", 2, "cannot be used with"),
+    ] {
+        let (out, err) = run(&folder, &args.split(' ').collect::<Vec<_>>(), code);
+        assert!((out + &err).contains(words), "{args}: {err}");
+    }
+}
+
+/// The files of a dataset are cut by its runs, are whole or not there, and hold the rows of the table.
+#[test]
+fn a_dataset_is_resumed_at_its_first_missing_file() {
+    let folder = folder("dataset");
+    texts(&folder);
+    let sweep = ["sweep", "spring.fric", "fixed", "--vary", "m ~ normal(1 kg, 0.2 kg)", "--runs", "700"];
+    let with = |more: &[&'static str]| [&sweep[..], &["--for", "0.3 s", "-q"], more].concat();
+    let said = |out| run(&folder, &[&sweep[..], &["--for", "0.3 s", "--no-error", "--out", out]].concat(), 0).0;
+    let (summary, other) = (said("one.csv"), said("set"));
+    let rest = |text: &str| text.lines().skip(1).map(|line| line.replace("one.csv", "set")).collect::<Vec<_>>();
+    assert_eq!(rest(&summary), rest(&other), "the summary is that of the table");
+    let whole = files(&folder.join("set"));
+    let names: Vec<&str> = whole.iter().map(|(name, _)| name.as_str()).collect();
+    assert_eq!(names, ["_fric.json", "part-00000000.parquet", "part-00000256.parquet", "part-00000512.parquet"]);
+    // As a process leaves it that was killed.
+    let asked: serde_json::Value = serde_json::from_slice(&whole[0].1).unwrap();
+    let asked: Vec<&str> = asked["asked"].as_array().unwrap().iter().map(|line| line.as_str().unwrap()).collect();
+    let begun = folder.join("set/._fric.json.unfinished");
+    fs::remove_file(folder.join("set/_fric.json")).unwrap();
+    fs::remove_file(folder.join("set/part-00000512.parquet")).unwrap();
+    fs::write(&begun, format!("{}\n\n", asked.join("\n"))).unwrap();
+    let (_, err) = run(&folder, &with(&["--out", "set"]), 1);
+    assert!(err.contains("set holds a sweep that is not finished"), "{err}");
+    let first = fs::metadata(folder.join("set/part-00000256.parquet")).unwrap().modified().unwrap();
+    run(&folder, &with(&["--out", "set", "--resume"]), 0);
+    assert_eq!(fs::metadata(folder.join("set/part-00000256.parquet")).unwrap().modified().unwrap(), first);
+    assert!(files(&folder.join("set")) == whole);
+    let (_, err) = run(&folder, &with(&["--out", "set", "--resume"]), 1);
+    assert!(err.contains("nothing to resume"), "{err}");
+    // A smaller one in its place leaves no file of the larger one.
+    run(&folder, &["sweep", "spring.fric", "fixed", "--vary", "k = 1 N/m, 2 N/m", "-q", "--out", "set/"], 0);
+    assert_eq!(files(&folder.join("set")).len(), 2);
+    let (_, err) = run(&folder, &with(&["--out", "set", "--shard", "1/2"]), 2);
+    assert!(err.contains("--plan and --unit"), "{err}");
+    fs::write(folder.join("file"), "").unwrap();
+    let (_, err) = run(&folder, &with(&["--out", "file"]), 1);
+    assert!(err.contains("file is a file, and a name without ending is that of a folder"), "{err}");
+}
+
+/// A table that was interrupted on one machine is finished by units, and one that was being joined by `--resume`.
+#[test]
+fn a_table_changes_between_machines_half_way() {
+    let folder = folder("half-way");
+    texts(&folder);
+    let sweep = ["sweep", "spring.fric", "fixed", "--vary", "m ~ normal(1 kg, 0.2 kg)", "--runs", "400", "-q"];
+    let with = |more: &[&'static str]| [&sweep[..], more].concat();
+    run(&folder, &with(&["--out", "one.csv"]), 0);
+    run(&folder, &with(&["--plan", "p"]), 0);
+    let one = fs::read(folder.join("one.csv")).unwrap();
+    // As a process leaves it that was killed: half of the rows, and what it was asked.
+    let mut child = fric(&folder, &with(&["--out", "t.csv", "--threads", "1"])).spawn().unwrap();
+    let half = || fs::metadata(folder.join("t.csv")).is_ok_and(|file| file.len() > 0);
+    while !half() && child.try_wait().unwrap().is_none() {
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    child.kill().unwrap();
+    child.wait().unwrap();
+    run(&folder, &["sweep", "--unit", "0..400", "p", "--out", "u", "-q"], 0);
+    run(&folder, &["sweep", "--join", "p", "u", "--out", "t.csv", "-q"], 0);
+    assert!(fs::read(folder.join("t.csv")).unwrap() == one);
+    assert!(!folder.join(".t.csv.unfinished").exists());
+    // The rows of another sweep that is not finished are kept.
+    let other = ["sweep", "spring.fric", "fixed", "--vary", "k = 10 N/m, 20 N/m", "-q", "--plan", "q"];
+    run(&folder, &other, 0);
+    run(&folder, &["sweep", "--unit", "0..2", "q", "--out", "v", "-q"], 0);
+    fs::write(folder.join(".t.csv.unfinished"), "asked for something else\n\n").unwrap();
+    let (_, err) = run(&folder, &["sweep", "--join", "q", "v", "--out", "t.csv", "-q"], 1);
+    assert!(err.contains("holds a sweep that is not finished"), "{err}");
+    assert!(fs::read(folder.join("t.csv")).unwrap() == one);
+}
+
+/// The script for Slurm, as the scheduler would start it: each task with its number, some of them twice.
+#[test]
+fn the_tasks_of_a_slurm_array_are_the_units_of_a_sweep() {
+    let folder = folder("slurm");
+    texts(&folder);
+    let sweep = ["sweep", "spring.fric", "fixed", "--vary", "m ~ normal(1 kg, 0.2 kg)", "--runs", "50", "-q"];
+    run(&folder, &[&sweep[..], &["--out", "one.csv"]].concat(), 0);
+    run(&folder, &[&sweep[..], &["--plan", "sweep.fricjob"]].concat(), 0);
+    let script = support::root().join("examples/cluster/slurm.sh");
+    let checked = Command::new("bash").arg("-n").arg(&script).status().expect("bash starts");
+    assert!(checked.success());
+    let binaries = Path::new(env!("CARGO_BIN_EXE_fric")).parent().unwrap();
+    let path = format!("{}:{}", binaries.display(), std::env::var("PATH").unwrap());
+    for task in [3, 0, 4, 2, 1, 3] {
+        let mut command = Command::new("bash");
+        command.arg(&script).args(["sweep.fricjob", "units"]).current_dir(&folder).stdin(Stdio::null());
+        command.env("PATH", &path).env("FRIC_UNITS", "5").env("SLURM_ARRAY_TASK_ID", task.to_string());
+        let output = command.env("SLURM_CPUS_PER_TASK", "1").output().unwrap();
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    }
+    let units: Vec<String> = (0..5).map(|task| format!("units/{task}.fricunit")).collect();
+    let units: Vec<&str> = units.iter().map(String::as_str).collect();
+    run(&folder, &[&["sweep", "--join", "sweep.fricjob"], &units[..], &["-q", "--out", "t.csv"]].concat(), 0);
+    assert!(fs::read(folder.join("t.csv")).unwrap() == fs::read(folder.join("one.csv")).unwrap());
+    let output = Command::new("bash").arg(&script).output().unwrap();
+    assert!(!output.status.success() && String::from_utf8_lossy(&output.stderr).contains("slurm.sh PLAN"));
+}
