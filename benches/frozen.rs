@@ -65,7 +65,7 @@ fn made(name: &str, text: &str, model: &str, method: Method) -> Result<Vec<Vec<u
     for width in Width::ALL {
         let lanes = step
             .as_ref()
-            .map(|step| lanes::bytes(step, &description.layout, description.pool.len(), width, width.vectors()));
+            .map(|step| lanes::bytes(step, &description.layout, description.pool.len(), width, width.vectors(), None));
         all.push(match lanes {
             Some(Ok(bytes)) => bytes.code,
             Some(Err(why)) => why.to_string().into_bytes(),

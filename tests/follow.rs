@@ -29,7 +29,9 @@ use support::{Texts, number};
 struct Seen {
     programs: u64,
     compiled: u64,
+    distributed: u64,
     in_lanes: u64,
+    by_code: u64,
     followed: u64,
     stopped: u64,
     lanes_stopped: u64,
@@ -112,6 +114,7 @@ fn compare(program: &Program, method: Method, step: f64, place: &str, random: &m
     assert!(!follows[1].is_compiled());
     seen.programs += 1;
     seen.compiled += u64::from(follows[0].is_compiled());
+    seen.distributed += u64::from(follows[0].is_distributed());
     let mut ways: Vec<(Instance, &Follow)> =
         vec![(instance(false), &follows[0]), (instance(true), &follows[0]), (instance(false), &follows[1])];
     for part in 0..3 {
@@ -140,9 +143,17 @@ fn compare(program: &Program, method: Method, step: f64, place: &str, random: &m
             break;
         }
     }
-    let Some(lanes) = tiering::lanes(program, method) else { return };
+    // Code for the loop over rows, or a step for each.
+    let by_code = random.below(4) != 0;
+    let lanes = if by_code {
+        tiering::lanes_on_rows(program, method, &read, &written)
+    } else {
+        tiering::lanes(program, method)
+    };
+    let Some(lanes) = lanes else { return };
     seen.in_lanes += 1;
-    let (width, count) = (lanes.width(), [1, 3, 50][random.below(3)]);
+    seen.by_code += u64::from(lanes.is_on_rows());
+    let (width, count) = (lanes.width(), [0, 1, 3, 50][random.below(4)]);
     let mut batch = Batch::new(lanes);
     let given: Vec<Vec<f64>> = (0..width).map(|_| rows(random, &start, &read, count, read.len())).collect();
     (0..width).for_each(|lane| batch.load(lane, start.block()));
@@ -226,6 +237,9 @@ fn rows_are_followed_as_a_call_for_each_would() {
     println!("seed {seed}: {seen:?}");
     assert!(seen.programs > of_library + 20, "random texts compile: {seen:?}");
     assert!(seen.stopped * 20 > seen.programs && seen.lanes_stopped > 0, "steps fail: {seen:?}");
+    assert!(seen.distributed * 8 > seen.programs, "inputs are worked on ahead: {seen:?}");
     assert!(seen.followed > 20 * seen.programs, "rows are followed: {seen:?}");
     assert!(!cfg!(target_arch = "x86_64") || seen.in_lanes * 10 > seen.programs * 9, "in lanes: {seen:?}");
+    let by_code = seen.by_code * 2 > seen.programs;
+    assert!(!cfg!(target_arch = "x86_64") || by_code, "lanes in a loop of their own: {seen:?}");
 }

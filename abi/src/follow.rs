@@ -5,6 +5,8 @@
 //! inputs and outputs are compiled into the loop; without machine code each row is a call of the step.
 
 use crate::description::{Layout, Slot};
+use crate::distributed_step::DistributedFollow;
+pub use crate::rows::{Rows, RowsMut};
 use std::any::Any;
 use std::sync::Arc;
 
@@ -23,24 +25,6 @@ compiled! {
     );
 }
 
-/// Rows of numbers, from the first column that counts.
-#[derive(Clone, Copy, Debug)]
-pub struct Rows<'a> {
-    /// The numbers, SI.
-    pub numbers: &'a [f64],
-    /// Distance of two rows. 0: one row for all steps.
-    pub stride: usize,
-}
-
-/// Rows of numbers to write.
-#[derive(Debug)]
-pub struct RowsMut<'a> {
-    /// The numbers, SI.
-    pub numbers: &'a mut [f64],
-    /// Distance of two rows, at least the number of columns.
-    pub stride: usize,
-}
-
 /// Which inputs and outputs a loop reads and writes, and its code.
 #[derive(Clone)]
 pub struct Follow {
@@ -55,6 +39,8 @@ struct Code {
     entry: FollowEntry,
     size: usize,
     pool_len: usize,
+    /// The loop again, in two parts.
+    ahead: Option<Arc<DistributedFollow>>,
     _memory: Arc<dyn Any + Send + Sync>,
 }
 
@@ -87,7 +73,21 @@ impl Follow {
         pool_len: usize,
         memory: Arc<dyn Any + Send + Sync>,
     ) -> Follow {
-        Follow { code: Some(Code { entry, size, pool_len, _memory: memory }), ..self }
+        Follow { code: Some(Code { entry, size, pool_len, ahead: None, _memory: memory }), ..self }
+    }
+
+    /// The same with a loop in two parts besides, which computes ahead what depends on inputs and time alone.
+    ///
+    /// # Safety
+    /// It must be the same loop, and valid as long as `memory` lives.
+    ///
+    /// # Panics
+    /// If there is no other code, or there is no such column: a bug in the caller.
+    pub unsafe fn with_distributed(self, ahead: DistributedFollow, memory: Arc<dyn Any + Send + Sync>) -> Follow {
+        assert!(ahead.columns().iter().all(|column| *column < self.inputs.len()), "columns that there are");
+        let code = self.code.expect("the code of the undivided loop");
+        let memory = Arc::new((code._memory, memory));
+        Follow { code: Some(Code { ahead: Some(Arc::new(ahead)), _memory: memory, ..code }), ..self }
     }
 
     /// The inputs, a column each.
@@ -103,6 +103,11 @@ impl Follow {
     /// Whether it has machine code.
     pub fn is_compiled(&self) -> bool {
         self.code.is_some()
+    }
+
+    /// Whether its code has two parts.
+    pub fn is_distributed(&self) -> bool {
+        self.code.as_ref().is_some_and(|code| code.ahead.is_some())
     }
 
     /// Checks that arrays have `count` rows.
@@ -143,13 +148,25 @@ impl Follow {
         inputs: &Rows,
         outputs: &mut RowsMut,
     ) -> Option<u64> {
-        let Code { entry, size, pool_len, .. } = self.code.as_ref()?;
+        let Code { entry, size, pool_len, ahead, .. } = self.code.as_ref()?;
         self.check(count, inputs, outputs);
         assert!(block.len() >= *size, "block of {} slots, {size} needed", block.len());
         assert!(pool.len() >= *pool_len, "pool of {} numbers, {pool_len} needed", pool.len());
+        let mut done = 0;
+        if let Some(ahead) = ahead {
+            // SAFETY: the lengths were just checked.
+            let (made, status) = unsafe { ahead.advance(block, pool, count, inputs, outputs) };
+            if status != 0 || made == count {
+                return Some(status);
+            }
+            done = made as usize;
+        }
         let strides = [inputs.stride, outputs.stride].map(|stride| 8 * stride as i64);
-        let (from, to) = (inputs.numbers.as_ptr(), outputs.numbers.as_mut_ptr());
+        let (from, to) = (inputs.numbers.get(done * inputs.stride..), outputs.numbers.get_mut(done * outputs.stride..));
+        // Rows without columns take no room.
+        let (from, to) = (from.unwrap_or_default().as_ptr(), to.unwrap_or_default().as_mut_ptr());
+        let left = count - done as u64;
         // SAFETY: by the contract of `with_code`, the entry accesses only the lengths that were just checked.
-        Some(unsafe { entry(block.as_mut_ptr(), pool.as_ptr(), count, from, to, strides.as_ptr()) })
+        Some(unsafe { entry(block.as_mut_ptr(), pool.as_ptr(), left, from, to, strides.as_ptr()) })
     }
 }

@@ -121,17 +121,20 @@ impl Instance {
     }
 
     /// The value of a slot, SI.
+    #[inline]
     pub fn get(&self, slot: Slot) -> f64 {
         self.block()[slot.index()]
     }
 
     /// Writes a slot, SI.
+    #[inline]
     pub fn set(&mut self, slot: Slot, value: f64) {
         self.is_prepared &= slot != Slot::STEP && !self.description.layout.params.contains(slot);
         self.numbers[..self.size][slot.index()] = value;
     }
 
     /// The block.
+    #[inline]
     pub fn block(&self) -> &[f64] {
         &self.numbers[..self.size]
     }
@@ -149,6 +152,7 @@ impl Instance {
 
     /// Runs one function up to `n` times, stops at the first non-zero status and returns it. After fixed steps, the
     /// block contains their count and the time.
+    #[inline]
     pub fn call_up_to(&mut self, function: Function, n: u64) -> u64 {
         let before = self.get(Slot::COUNT);
         let single = if (function, n) == (Function::Step, 1) { self.step_prepared() } else { None };
@@ -162,6 +166,7 @@ impl Instance {
     }
 
     /// One fixed step with hoisted values, if the code has such a step.
+    #[inline]
     fn step_prepared(&mut self) -> Option<u64> {
         let machine = self.step.made(Function::Step)?;
         let size = self.size + machine.prepared()?.len;
@@ -202,6 +207,7 @@ impl Instance {
     }
 
     /// Advances by up to `n` fixed steps, stops at the first non-zero status and returns it.
+    #[inline]
     pub fn advance(&mut self, n: u64) -> u64 {
         self.call_up_to(Function::Step, n)
     }

@@ -16,6 +16,37 @@ compiled! {
     pub type LanesEntry = fn(block: *mut f64, pool: *const f64, count: u64, statuses: *mut u64);
 }
 
+compiled! {
+    /// The same in a loop over rows: step `i` has inputs from row `i` instead of their slots, and writes row `i` of outputs,
+    /// also if the status of a lane is not 0. A row has the numbers of all lanes for each column:
+    /// `inputs[(i · columns + k) · width + lane]`. The slots of these inputs keep their values.
+    pub type FollowLanesEntry = fn(
+        block: *mut f64,
+        pool: *const f64,
+        count: u64,
+        statuses: *mut u64,
+        inputs: *const f64,
+        outputs: *mut f64
+    );
+}
+
+/// Code of a step in a loop over rows, for many instances at once.
+#[derive(Clone)]
+pub struct FollowLanes {
+    /// The code.
+    pub entry: FollowLanesEntry,
+    /// The columns of inputs.
+    pub inputs: Vec<Slot>,
+    /// The columns of outputs.
+    pub outputs: Vec<Slot>,
+    /// Which of these the code writes: those that a step stores.
+    pub stored: Vec<bool>,
+    /// Numbers of scratch space after the blocks.
+    pub scratch: usize,
+    /// The owner of the code.
+    pub memory: Arc<dyn Any + Send + Sync>,
+}
+
 /// The step of a model, for many instances at once.
 #[derive(Clone)]
 pub struct Lanes {
@@ -27,6 +58,7 @@ pub struct Lanes {
     name: String,
     /// Outputs that the step does not store.
     left_out: Arc<[Slot]>,
+    on_rows: Option<Arc<FollowLanes>>,
     _memory: Arc<dyn Any + Send + Sync>,
 }
 
@@ -46,12 +78,28 @@ impl Lanes {
         name: String,
         memory: Arc<dyn Any + Send + Sync>,
     ) -> Lanes {
-        Lanes { entry, width, size, scratch, pool_len, name, left_out: Arc::default(), _memory: memory }
+        Lanes { entry, width, size, scratch, pool_len, name, left_out: Arc::default(), on_rows: None, _memory: memory }
     }
 
     /// The same code, whose step does not store these outputs: see [`Slice`](crate::Slice).
     pub fn leaving_out(self, left_out: Arc<[Slot]>) -> Lanes {
         Lanes { left_out, ..self }
+    }
+
+    /// The same, with code for a loop over rows of the same step.
+    ///
+    /// # Safety
+    /// The entry must be valid as long as its memory lives, must access only `block[..size * width + scratch]`,
+    /// `pool[..pool_len]`, `statuses[..width]`, and in each row as many numbers as there are columns and lanes, and must not
+    /// unwind.
+    pub unsafe fn with_rows(self, code: FollowLanes) -> Lanes {
+        assert_eq!(code.stored.len(), code.outputs.len(), "one for each column");
+        Lanes { on_rows: Some(Arc::new(code)), ..self }
+    }
+
+    /// Whether it has code for a loop over rows.
+    pub fn is_on_rows(&self) -> bool {
+        self.on_rows.is_some()
     }
 
     /// The outputs that its step does not store.
@@ -76,7 +124,8 @@ impl Lanes {
 
     /// Number of doubles for all blocks and the scratch space.
     pub(crate) fn room(&self) -> usize {
-        self.size * self.width + self.scratch
+        let scratch = self.on_rows.as_ref().map_or(0, |code| code.scratch);
+        self.size * self.width + self.scratch.max(scratch)
     }
 
     /// Runs the code.
@@ -232,22 +281,76 @@ impl Batch {
         let width = self.lanes.width;
         assert_eq!(given.len(), rows * inputs.len() * width, "{rows} rows of inputs");
         assert_eq!(taken.len(), rows * outputs.len() * width, "{rows} rows of outputs");
-        let begins = |slots: &[Slot]| slots.iter().map(|slot| self.begin_of(*slot)).collect::<Vec<usize>>();
-        let (from, to) = (begins(inputs), begins(outputs));
+        let code = self.lanes.on_rows.clone();
+        if let Some(code) = code.filter(|code| code.inputs == inputs && code.outputs == outputs) {
+            return self.follow_by_code(&code, pool, given, taken, rows, failed);
+        }
+        let to: Vec<usize> = outputs.iter().map(|slot| self.begin_of(*slot)).collect();
         for row in 0..rows {
-            for (k, at) in from.iter().enumerate() {
-                let column = &given[(row * inputs.len() + k) * width..][..width];
-                self.flat_mut()[*at..*at + width].copy_from_slice(column);
-            }
+            self.give(inputs, &given[row * inputs.len() * width..]);
             self.advance(pool, 1);
             for (k, at) in to.iter().enumerate() {
                 let column = &mut taken[(row * outputs.len() + k) * width..][..width];
                 column.copy_from_slice(&self.flat()[*at..*at + width]);
             }
-            if (0..width).any(|lane| self.status(lane) != 0) {
+            if self.has_failed() {
                 failed(row, self);
             }
         }
+    }
+
+    /// The same by the code for it.
+    fn follow_by_code(
+        &mut self,
+        code: &FollowLanes,
+        pool: &[f64],
+        given: &[f64],
+        taken: &mut [f64],
+        rows: usize,
+        failed: &mut dyn FnMut(usize, &Batch),
+    ) {
+        let (width, needed) = (self.lanes.width, self.lanes.pool_len);
+        let (n, m) = (code.inputs.len() * width, code.outputs.len() * width);
+        assert!(pool.len() >= needed, "pool of {} numbers, {needed} needed", pool.len());
+        let mut done = 0;
+        while done < rows {
+            self.statuses.fill(Aligned([0; 8]));
+            let (numbers, statuses) = (self.numbers.as_mut_ptr().cast(), self.statuses.as_mut_ptr().cast());
+            let (from, to) = (given[done * n..].as_ptr(), taken[done * m..].as_mut_ptr());
+            // SAFETY: `Batch::new` has allocated the numbers and statuses, and the lengths of pool and rows were checked.
+            let made = unsafe { (code.entry)(numbers, pool.as_ptr(), (rows - done) as u64, statuses, from, to) };
+            done += made as usize;
+            self.give(&code.inputs, &given[(done - 1) * n..]);
+            if self.has_failed() {
+                failed(done - 1, self);
+            }
+        }
+        // No step stores these columns: they are inputs, or the same in each row.
+        for k in (0..code.outputs.len()).filter(|k| !code.stored[*k]) {
+            let at = self.begin_of(code.outputs[k]);
+            let column = code.inputs.iter().position(|input| *input == code.outputs[k]);
+            for row in 0..rows {
+                let from = match column {
+                    Some(column) => &given[row * n + column * width..][..width],
+                    None => &self.flat()[at..at + width],
+                };
+                taken[row * m + k * width..][..width].copy_from_slice(from);
+            }
+        }
+    }
+
+    /// Writes the slots of a row of inputs.
+    fn give(&mut self, inputs: &[Slot], row: &[f64]) {
+        let width = self.lanes.width;
+        for (slot, column) in inputs.iter().zip(row.chunks_exact(width)) {
+            let at = self.begin_of(*slot);
+            self.flat_mut()[at..at + width].copy_from_slice(column);
+        }
+    }
+
+    /// Whether the status of a lane is not 0.
+    fn has_failed(&self) -> bool {
+        (0..self.lanes.width).any(|lane| self.status(lane) != 0)
     }
 
     /// Index of the number of a slot in the first lane.

@@ -25,6 +25,7 @@ pub mod foreign;
 pub mod description;
 pub mod rosenbrock;
 pub mod lanes;
+pub mod rows;
 pub mod distributed_step;
 pub mod follow;
 pub mod table;

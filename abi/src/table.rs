@@ -193,12 +193,14 @@ impl Machine {
     }
 
     /// The single step with hoisted values, if there is one.
+    #[inline]
     pub fn prepared(&self) -> Option<Prepared> {
         self.prepared
     }
 
     /// One fixed step on a block followed by the values of [`Prepared`], and its status. `is_current`: the values need not
     /// be computed again. `None` if the code has no such step.
+    #[inline]
     pub fn step_prepared(&self, block: &mut [f64], pool: &[f64], is_current: bool) -> Option<u64> {
         let Prepared { prepare, step, len } = self.prepared?;
         self.check(block, pool, len);
@@ -235,6 +237,7 @@ impl Code {
     }
 
     /// Machine code of a function, if it has been compiled by now.
+    #[inline]
     pub fn made(&self, function: Function) -> Option<&Machine> {
         match self {
             Code::Machine(machine) => Some(machine),

@@ -205,7 +205,7 @@ impl<'a> Emitter<'a> {
     ) {
         let is_piece = called == Entry::Piece;
         target.signature = if is_piece { signature_of_piece(self.isa) } else { signature(self.isa) };
-        let more = if self.cfg.rows.is_some() { 3 } else { usize::from(self.cfg.leading.is_some()) };
+        let more = 3 * usize::from(self.cfg.rows.is_some()) + usize::from(self.cfg.leading.is_some());
         target.signature.params.extend(vec![AbiParam::new(types::I64); more]);
         let mut b = FunctionBuilder::new(target, context);
         let order = self.cfg.order(entry);
@@ -214,13 +214,13 @@ impl<'a> Emitter<'a> {
         b.switch_to_block(first);
         let &[block, pool, third, ref more @ ..] = b.block_params(first) else { unreachable!("three parameters") };
         let more = more.to_vec();
-        let rows = if let [inputs, outputs, strides] = more[..] {
+        let rows = if let [inputs, outputs, strides, ..] = more[..] {
             let mut stride = |at| b.ins().load(types::I64, MemFlagsData::trusted(), strides, at);
             Some([(inputs, stride(0)), (outputs, stride(8))])
         } else {
             None
         };
-        let leading = more.first().copied().filter(|_| rows.is_none());
+        let leading = more.last().copied().filter(|_| self.cfg.leading.is_some());
         self.now = Function {
             block: Some(block),
             pool: Some(pool),

@@ -40,7 +40,7 @@ pub fn emit(
         return Err(Unsupported("a ring of samples (delay) has no lanes".into()));
     }
     let types = verify::types(func).expect("the function is sound");
-    let step = VectorStep { func, types, vectors, plan: plan(func, layout.size(), vectors * BYTES) };
+    let step = VectorStep { func, types, vectors, plan: plan(func, layout.size(), vectors * BYTES, None) };
     let plan = &step.plan;
     target.signature = signature(isa);
     target.signature.params.push(AbiParam::new(types::I64));

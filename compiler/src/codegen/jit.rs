@@ -11,9 +11,9 @@ use crate::codegen::forms::{Context, Form, Options};
 use crate::codegen::lanes::{self, Width};
 use crate::codegen::passes;
 use crate::ir::Func;
-use crate::ir::cfg::{Entry as Called, Leading, Rows};
+use crate::ir::cfg::{Cfg, Entry as Called, Leading, Rows};
 use crate::ir::verify::{Stage, verify};
-use abi::distributed_step::{DistributedStep, RemainingEntry};
+use abi::distributed_step::{DistributedFollow, DistributedStep, LeadingLoop, RemainingEntry, RemainingFollowEntry};
 use abi::follow::{Follow, FollowEntry};
 use abi::table::{Entry, Machine, Prepared};
 use abi::{Function, Layout, Slot};
@@ -86,25 +86,50 @@ pub fn compile_with(
 /// loop are successive instants of time.
 fn distributed(step: &Func, layout: &Layout, pool_len: usize, options: &Options) -> Option<DistributedStep> {
     let graph = passes::run(step, Form::Distributed, Called::Several, &Context { layout: Some(layout), options });
-    let Leading { invariants, instants, layout: own, loads, .. } = &**graph.leading.as_ref()?;
-    let (invariants, instants) = Width::here_all().find_map(|width| {
-        let lanes = |func: &Func| lanes::compile(func, own, pool_len, width, width.vectors()).ok();
+    let leading = leading(graph.leading.as_ref()?, pool_len)?;
+    let (entry, executable) = remaining(step, &graph, &leading, options)?;
+    // SAFETY: `entry` is the start of code with the signature of `RemainingEntry`.
+    let entry = unsafe { std::mem::transmute::<*const u8, RemainingEntry>(entry) };
+    // SAFETY: the entry lives as long as its memory; `loop_distribution` keeps every access to block and pool as it was in
+    // the step, which is verified, and loads one output of the leading loop for each of its values; code without calls does
+    // not unwind.
+    unsafe { DistributedStep::new(leading, entry, executable) }
+}
+
+/// Compiles a leading loop for the widest vectors that have its instructions.
+fn leading(leading: &Leading, pool_len: usize) -> Option<LeadingLoop> {
+    let Leading { invariants, instants, layout, loads, columns, .. } = leading;
+    let reads = instants.loads();
+    let (once, instants) = Width::here_all().find_map(|width| {
+        let lanes = |func: &Func| lanes::compile(func, layout, pool_len, width, width.vectors()).ok();
         let instants = lanes(instants)?;
         match invariants {
             Some(invariants) => Some((Some(lanes(invariants)?), instants)),
             None => Some((None, instants)),
         }
     })?;
-    let bytes = FunctionCompiler::new(here_with(options.registers).ok()?)
-        .remaining_loop(step, &graph, instants.width())
-        .ok()?;
+    let is_timed = [Slot::TIME, Slot::COUNT].iter().any(|slot| reads.contains(slot));
+    Some(LeadingLoop {
+        once,
+        instants,
+        layout: layout.clone(),
+        loads: loads.clone(),
+        columns: columns.clone(),
+        is_timed,
+    })
+}
+
+/// Compiles the remaining loop that goes with a leading one; returns the address of its entry, and its memory.
+fn remaining(
+    step: &Func,
+    graph: &Cfg,
+    leading: &LeadingLoop,
+    options: &Options,
+) -> Option<(*const u8, Arc<Executable>)> {
+    let mut compiler = FunctionCompiler::new(here_with(options.registers).ok()?);
+    let bytes = compiler.remaining_loop(step, graph, leading.instants.width()).ok()?;
     let executable = Executable::new(&bytes.code, bytes.alignment as u64).ok()?;
-    // SAFETY: `address` is the start of code with the signature of `RemainingEntry`.
-    let entry = unsafe { std::mem::transmute::<*const u8, RemainingEntry>(executable.address()) };
-    // SAFETY: the entry lives as long as its memory; `loop_distribution` keeps every access to block and pool as it was in
-    // the step, which is verified, and loads one output of `own` for each value of the leading loop; code without calls
-    // does not unwind.
-    unsafe { DistributedStep::new(invariants, instants, own.clone(), loads.clone(), entry, Arc::new(executable)) }
+    Some((executable.address(), Arc::new(executable)))
 }
 
 /// Compiles the loop of a fixed step over rows of inputs and outputs.
@@ -124,13 +149,29 @@ pub fn follow(
     verify(step, layout, pool_len, Stage::Expanded).unwrap_or_else(|fault| panic!("{fault}"));
     let follow = Follow::new(layout, inputs, outputs);
     let rows = Rows { inputs: inputs.to_vec(), outputs: outputs.to_vec() };
-    let bytes = FunctionCompiler::new(here()?).on_rows(step, rows)?;
+    let bytes = FunctionCompiler::new(here()?).on_rows(step, rows.clone())?;
     let executable = Executable::new(&bytes.code, bytes.alignment as u64)?;
     // SAFETY: `address` is the start of code with the signature of `FollowEntry`.
     let entry = unsafe { std::mem::transmute::<*const u8, FollowEntry>(executable.address()) };
     // SAFETY: the entry lives as long as its memory; every access to block and pool is that of the step, which is verified,
     // and `form_loop` makes one column for each input and output; code without calls does not unwind.
-    Ok(unsafe { follow.with_code(entry, layout.size(), pool_len, Arc::new(executable)) })
+    let follow = unsafe { follow.with_code(entry, layout.size(), pool_len, Arc::new(executable)) };
+    let options = Options::default();
+    let context = Context { layout: Some(layout), options: &options };
+    let graph = passes::run_on_rows(step, rows, Form::Distributed, &context);
+    let ahead = graph.leading.as_ref().and_then(|found| {
+        let leading = leading(found, pool_len)?;
+        let (entry, executable) = remaining(step, &graph, &leading, &options)?;
+        // SAFETY: `entry` is the start of code with the signature of `RemainingFollowEntry`.
+        let entry = unsafe { std::mem::transmute::<*const u8, RemainingFollowEntry>(entry) };
+        // SAFETY: as for the step.
+        Some((unsafe { DistributedFollow::new(leading, entry) }?, executable))
+    });
+    Ok(match ahead {
+        // SAFETY: it is the same loop, and lives as long as its memory.
+        Some((ahead, memory)) => unsafe { follow.with_distributed(ahead, memory) },
+        None => follow,
+    })
 }
 
 type Entries = [Option<Entry>; Function::ALL.len()];

@@ -1,5 +1,5 @@
 //! Loop distribution: one loop over steps becomes two, a vectorised leading loop for everything that depends on time
-//! alone, and a remaining loop for the states.
+//! alone, or on inputs from rows, and a remaining loop for the states.
 //!
 //! In: a step in one block. Out: if it pays, the remaining step, which loads the outputs of the leading loop from slots after
 //! the block, and the leading loop, whose lanes are successive instants of time. The leading loop is not made of blocks of
@@ -8,24 +8,25 @@
 //!
 //! ```text
 //! invariants   operations that no step changes                     from parameters, inputs, step length
-//! instants     operations that depend on these and on time alone   lanes are successive instants
+//! instants     operations on these, on time and rows of inputs     lanes are successive instants
 //! remaining    the step, which loads the outputs of instants
 //! ```
 //! Only for many steps per call and code in memory: images run in real time, one step per call.
 //!
 //! Source: Kennedy, Allen, *Optimizing Compilers for Modern Architectures*, 2001, ch. 5.
 
-use crate::ir::cfg::{BlockId, Cfg, Leading};
+use crate::ir::cfg::{BlockId, Cfg, Leading, Rows};
 use crate::ir::hash::HashSet;
-use crate::ir::variance::{Variance, variance};
+use crate::ir::variance::{Variance, with_rows};
 use crate::ir::{Func, Op, Type, Value, verify};
 use abi::{Layout, Slot};
 
 /// Distributes a step that works on blocks of this layout, if that pays.
 pub fn loop_distribution(cfg: &mut Cfg, layout: &Layout) {
     let Some(func) = cfg.straight_line(BlockId(0)) else { return };
-    if let Some((leading, remaining)) = split(&func, layout.size()) {
-        *cfg = Cfg { leading: Some(Box::new(leading)), ..Cfg::straight(&remaining, cfg.called) };
+    if let Some((leading, remaining)) = split(&func, layout.size(), cfg.rows.as_ref()) {
+        let rows = cfg.rows.take();
+        *cfg = Cfg { leading: Some(Box::new(leading)), rows, ..Cfg::straight(&remaining, cfg.called) };
     }
 }
 
@@ -36,13 +37,14 @@ fn least_effort(passed: usize) -> u32 {
 }
 
 /// Divides a step that works on blocks of `size` slots; none if distribution does not pay.
-fn split(func: &Func, size: usize) -> Option<(Leading, Func)> {
+fn split(func: &Func, size: usize, rows: Option<&Rows>) -> Option<(Leading, Func)> {
     if !advances_time(func) {
         return None;
     }
     let types = verify::types(func).expect("the function is sound");
-    let on = variance(func, None);
-    let passed = passed(func, &on, &types);
+    let in_rows = rows.map_or(&[][..], |rows| &rows.inputs);
+    let on = with_rows(func, in_rows);
+    let passed = passed(func, &on, &types, rows);
     let closure = |mut marks: Vec<bool>, through: &dyn Fn(usize) -> bool| {
         for i in (0..func.ops.len()).rev() {
             if marks[i] && through(i) {
@@ -78,10 +80,16 @@ fn split(func: &Func, size: usize) -> Option<(Leading, Func)> {
             _ => {}
         }
     }
-    let layout = Layout::new([loads.len() as u32, 0, invariants.len() as u32, 0, 0, passed.len() as u32, 0, 0, 0, 0]);
-    let own_slot = |slot: Slot| match loads.iter().position(|known| *known == slot) {
-        Some(k) => layout.params.slot(k),
-        None => slot,
+    let is_read = |slot: &Slot| ops(&in_leading).into_iter().any(|value| func.op(value) == Op::Load(*slot));
+    let columns: Vec<usize> = (0..in_rows.len()).filter(|column| is_read(&in_rows[*column])).collect();
+    let lens = [loads.len(), columns.len(), invariants.len(), 0, 0, passed.len(), 0, 0, 0, 0];
+    let layout = Layout::new(lens.map(|len| len as u32));
+    let own_slot = |slot: Slot| {
+        let column = || columns.iter().position(|column| in_rows[*column] == slot);
+        match loads.iter().position(|known| *known == slot) {
+            Some(k) => layout.params.slot(k),
+            None => column().map_or(slot, |k| layout.inputs.slot(k)),
+        }
     };
     let mut first = LoopPart::new("once", func);
     for value in ops(&in_invariants) {
@@ -106,7 +114,7 @@ fn split(func: &Func, size: usize) -> Option<(Leading, Func)> {
         }
     }
     let invariants = (!invariants.is_empty()).then(|| first.finish());
-    let leading = Leading { invariants, instants: leading.finish(), layout, loads, size };
+    let leading = Leading { invariants, instants: leading.finish(), layout, loads, columns, size };
     Some((leading, remaining.finish_as(func)))
 }
 
@@ -125,24 +133,27 @@ fn advances_time(func: &Func) -> bool {
         }
 }
 
-/// The values to pass from the leading to the remaining loop: values that depend on time alone and that each step
-/// needs, for states, rings or guards. Other outputs only matter after the last step, so they are not computed ahead.
-fn passed(func: &Func, on: &[Variance], types: &[Type]) -> Vec<Value> {
+/// The values to pass from the leading to the remaining loop: values that depend on time and rows of inputs alone and that
+/// each step needs, for states, rings, guards or rows of outputs. Other outputs only matter after the last step, so they
+/// are not computed ahead.
+fn passed(func: &Func, on: &[Variance], types: &[Type], rows: Option<&Rows>) -> Vec<Value> {
     let loaded: HashSet<Slot> = func.loads().into_iter().collect();
     let carried = |slot: &Slot| loaded.contains(slot) && ![Slot::TIME, Slot::COUNT].contains(slot);
     let states: Vec<Value> = func.stores.iter().filter(|(slot, _)| carried(slot)).map(|(_, value)| *value).collect();
     // Steps that hand nothing to the next one already overlap in the processor, and a step of one instant computes only
     // one arm of a select.
-    if states.is_empty() && func.writes.is_empty() {
+    if states.is_empty() && func.writes.is_empty() && rows.is_none() {
         return Vec::new();
     }
+    let in_row = |slot: &Slot| rows.is_some_and(|rows| rows.outputs.contains(slot));
+    let recorded = func.stores.iter().filter(|(slot, _)| in_row(slot)).map(|(_, value)| *value);
     let written = func.writes.iter().flat_map(|write| [write.index, write.value]);
     let guard = func.status.map(|status| match func.op(status) {
         Op::Select(when, _, zero) if func.op(zero) == Op::Int(0) => when,
         _ => status,
     });
     let mut needed = vec![false; func.ops.len()];
-    states.into_iter().chain(written).chain(guard).for_each(|value| needed[value.index()] = true);
+    states.into_iter().chain(written).chain(guard).chain(recorded).for_each(|value| needed[value.index()] = true);
     let mut passed = Vec::new();
     for i in (0..func.ops.len()).rev() {
         let op = func.ops[i];

@@ -6,12 +6,13 @@
 //!
 //! ```text
 //! prologue   invariants that other parts read; their results lie in memory
-//! body       carried slots and the test for failure; no outputs
+//! body       carried slots, rows of outputs and the test for failure; no other outputs
 //! last       everything
 //!
 //! block | first area of carried slots | second area | hoisted values | end
 //! ```
 
+use crate::ir::cfg::Rows;
 use crate::ir::hash::HashSet;
 use crate::ir::variance::{Slots, Variance, propagate};
 use abi::Slot;
@@ -45,6 +46,8 @@ pub trait StraightLine {
 pub struct LoopPlan<N> {
     /// Slots that one step passes to the next, with the stored node.
     pub carried: Vec<(Slot, N)>,
+    /// Columns of the rows of outputs, with the stored node. Those of slots that no step stores are not among them.
+    pub recorded: Vec<(usize, N)>,
     /// Invariants that later parts read, in the order of their places in memory.
     pub hoisted: Vec<N>,
     /// The nodes before the loop.
@@ -61,21 +64,27 @@ pub struct LoopPlan<N> {
     pub end: usize,
 }
 
-/// Plans the loop over a step. `size`: slots of the block. `vectors`: bytes of all vectors of one value.
-pub fn plan<L: StraightLine>(line: &L, size: usize, vectors: usize) -> LoopPlan<L::Node> {
+/// Plans the loop over a step. `size`: slots of the block. `vectors`: bytes of all vectors of one value. `rows`: inputs that
+/// each step reads from a row, and outputs that it writes to one.
+pub fn plan<L: StraightLine>(line: &L, size: usize, vectors: usize, rows: Option<&Rows>) -> LoopPlan<L::Node> {
     let loaded: HashSet<Slot> = (0..line.count()).filter_map(|i| line.load(i)).collect();
     let carried: Vec<(Slot, L::Node)> =
         line.stores().iter().copied().filter(|(slot, _)| loaded.contains(slot)).collect();
-    // Without carried slots a single iteration is enough, so nothing is hoisted.
-    let slots = Slots::new(line.stores().iter().map(|(slot, _)| *slot), None);
+    let stored = |slot: Slot| line.stores().iter().find(|(known, _)| *known == slot).map(|(_, node)| *node);
+    let columns = rows.map_or(&[][..], |rows| &rows.outputs).iter().enumerate();
+    let recorded: Vec<(usize, L::Node)> = columns.filter_map(|(column, slot)| Some((column, stored(*slot)?))).collect();
+    // Without carried slots and rows a single iteration is enough, so nothing is hoisted.
+    let is_single = carried.is_empty() && rows.is_none();
+    let in_rows = rows.map_or(&[][..], |rows| &rows.inputs);
+    let slots = Slots::new(line.stores().iter().map(|(slot, _)| *slot), None).reading_rows(in_rows);
     let own = |i: usize| line.load(i).map_or(Variance::Parameters, |slot| slots.of(slot));
     let operands = |i: usize, each: &mut dyn FnMut(usize)| {
         line.operands(i).into_iter().for_each(|operand| each(L::index(operand)));
     };
     let variance = propagate(line.count(), own, operands);
-    let variant: Vec<bool> =
-        variance.into_iter().map(|variance| carried.is_empty() || !variance.is_invariant()).collect();
-    let roots: Vec<L::Node> = carried.iter().map(|(_, node)| *node).chain(line.failed()).collect();
+    let variant: Vec<bool> = variance.into_iter().map(|variance| is_single || !variance.is_invariant()).collect();
+    let each = carried.iter().map(|(_, node)| *node).chain(recorded.iter().map(|(_, node)| *node));
+    let roots: Vec<L::Node> = each.chain(line.failed()).collect();
     let body = line.schedule(&roots, &variant);
     let results: Vec<L::Node> = line.stores().iter().map(|(_, node)| *node).chain(line.status()).collect();
     let last = line.schedule(&results, &variant);
@@ -90,5 +99,5 @@ pub fn plan<L: StraightLine>(line: &L, size: usize, vectors: usize) -> LoopPlan<
     let areas = [0, 1].map(|area| (size + area * carried.len()) * vectors);
     let hoisted_at = areas[1] + carried.len() * vectors;
     let end = hoisted_at + hoisted.len() * vectors;
-    LoopPlan { carried, hoisted, prologue, body, last, areas, hoisted_at, end }
+    LoopPlan { carried, recorded, hoisted, prologue, body, last, areas, hoisted_at, end }
 }

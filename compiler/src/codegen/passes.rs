@@ -46,7 +46,7 @@ pub static LATE: [Pass; 12] = [
     pass("hoist_params", &[Single], |cfg, context| _ = context.layout.map(|layout| hoist_params(cfg, layout)),
         "computes expressions of parameters and the step length once; in memory"),
     pass("loop_distribution", &[Distributed], |cfg, context| _ = context.layout.map(|layout| loop_distribution(cfg, layout)),
-        "computes what depends on time alone in a leading vectorised loop"),
+        "computes what depends on time or rows of inputs alone in a leading vectorised loop"),
     pass("unswitch", &[Single], |cfg, _| unswitch(cfg),
         "copies the step for each answer to a comparison that three automata or more test"),
     pass("specialise_modes", &[Single, Once], |cfg, _| specialise_modes(cfg),
@@ -90,10 +90,10 @@ pub fn run(func: &Func, form: Form, called: Entry, context: &Context) -> Cfg {
     apply_all(Cfg::straight(func, called), form, context)
 }
 
-/// Runs all passes on a step in a loop over rows of inputs and outputs.
-pub fn run_on_rows(func: &Func, rows: Rows, context: &Context) -> Cfg {
+/// Runs all passes on a step in a loop over rows of inputs and outputs, for a form that is a loop.
+pub fn run_on_rows(func: &Func, rows: Rows, form: Form, context: &Context) -> Cfg {
     let cfg = Cfg { rows: Some(rows), ..Cfg::straight(func, Entry::Several) };
-    apply_all(cfg, Loop, context)
+    apply_all(cfg, form, context)
 }
 
 fn apply_all(mut cfg: Cfg, form: Form, context: &Context) -> Cfg {

@@ -101,8 +101,10 @@ impl<'a> FunctionCompiler<'a> {
         Ok(Some(PreparedBytes { bytes, loop_offset, prepare, len }))
     }
 
-    /// Compiles the remaining loop of a distributed step, with the signature of [`abi::distributed_step::RemainingEntry`]. It reads values
-    /// that the leading loop has computed, one for each of `lanes` steps.
+    /// Compiles the remaining loop of a distributed step, with the signature of
+    /// [`RemainingEntry`](abi::distributed_step::RemainingEntry), or, if the graph has rows, of
+    /// [`RemainingFollowEntry`](abi::distributed_step::RemainingFollowEntry). It reads values that the leading loop has
+    /// computed, one for each of `lanes` steps.
     pub fn remaining_loop(&mut self, func: &Func, graph: &Cfg, lanes: usize) -> Result<Bytes, Unsupported> {
         self.entry(func, graph, (BlockId(0), Entry::Several), lanes)
     }
@@ -115,7 +117,7 @@ impl<'a> FunctionCompiler<'a> {
         if self.is_long(func) {
             return Err(Unsupported(format!("`{}` is divided into pieces", func.name)));
         }
-        let graph = passes::run_on_rows(func, rows, &Passes { layout: None, options: &self.options });
+        let graph = passes::run_on_rows(func, rows, Form::Loop, &Passes { layout: None, options: &self.options });
         self.entry(func, &graph, (BlockId(0), Entry::Several), 0)
     }
 

@@ -10,6 +10,7 @@ use crate::codegen::forms::{Options, Registers};
 use crate::codegen::lanes::{self, Width};
 use crate::codegen::{jit, target};
 use crate::ir::Func;
+use crate::ir::cfg::Rows;
 use crate::ir::interpret::Interpreter;
 use crate::ir::program::Program;
 use crate::math;
@@ -74,6 +75,23 @@ pub fn lanes(program: &Program, method: Method) -> Option<Lanes> {
         _ => width.vectors(),
     };
     Width::here_all().find_map(|width| lanes_of(program, method, width, vectors(width)))
+}
+
+/// As [`lanes`](lanes()) for a fixed step, with code for its loop over rows of these inputs and outputs where these vectors
+/// have it.
+///
+/// # Panics
+/// For the adaptive method.
+pub fn lanes_on_rows(program: &Program, method: Method, inputs: &[Slot], outputs: &[Slot]) -> Option<Lanes> {
+    let Description { layout, pool, .. } = &program.description;
+    let rows = Rows { inputs: inputs.to_vec(), outputs: outputs.to_vec() };
+    let step = step(program, method);
+    Width::here_all().find_map(|width| {
+        let vectors = width.vectors();
+        let lanes = lanes_of(program, method, width, vectors)?;
+        let on_rows = lanes::with_rows(lanes.clone(), &step, layout, pool.len(), (width, vectors), &rows);
+        Some(on_rows.unwrap_or(lanes))
+    })
 }
 
 /// The loop of a fixed step over rows of inputs and outputs. It calls the step for each row where `interpret` is set or

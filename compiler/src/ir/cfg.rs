@@ -174,18 +174,20 @@ pub enum Entry {
     Piece,
 }
 
-/// The leading loop of a distributed step: it computes what depends on time alone, for several instants at once, and is
-/// vectorised, so it keeps the straight-line form that lanes read.
+/// The leading loop of a distributed step: it computes what depends on time and rows of inputs alone, for several instants at
+/// once, and is vectorised, so it keeps the straight-line form that lanes read.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Leading {
     /// On blocks of `layout`: parameters → states. None if there are no invariants.
     pub invariants: Option<Func>,
-    /// On blocks of `layout`: time, count, parameters, states → outputs.
+    /// On blocks of `layout`: time, count, parameters, inputs, states → outputs.
     pub instants: Func,
     /// The layout of the two.
     pub layout: Layout,
     /// For each parameter of `layout`, the slot of the model that it copies.
     pub loads: Vec<Slot>,
+    /// For each input of `layout`, its column in the rows.
+    pub columns: Vec<usize>,
     /// Slots of the model's block: the step loads the outputs from the slots after it.
     pub size: usize,
 }

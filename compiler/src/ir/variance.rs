@@ -19,7 +19,7 @@ pub enum Variance {
     Parameters,
     /// Inputs and other slots that no step stores: the same during one call of several steps.
     Inputs,
-    /// Time and the step counter: known before the states are.
+    /// Time, the step counter, and inputs from rows: known before the states are.
     Time,
     /// Samples that earlier steps have written to a ring.
     Samples,
@@ -37,13 +37,20 @@ impl Variance {
 /// The variance of the slots of a function.
 pub struct Slots<'l> {
     stored: HashSet<Slot>,
+    /// Inputs that each step reads from a row of its own.
+    in_rows: &'l [Slot],
     layout: Option<&'l Layout>,
 }
 
 impl<'l> Slots<'l> {
     /// The slots of a function that stores these. Without a layout no slot is known to be a parameter.
     pub fn new(stored: impl Iterator<Item = Slot>, layout: Option<&'l Layout>) -> Slots<'l> {
-        Slots { stored: stored.collect(), layout }
+        Slots { stored: stored.collect(), in_rows: &[], layout }
+    }
+
+    /// The same, where steps read these inputs from rows.
+    pub fn reading_rows(self, in_rows: &'l [Slot]) -> Slots<'l> {
+        Slots { in_rows, ..self }
     }
 
     /// The variance of a load.
@@ -51,6 +58,7 @@ impl<'l> Slots<'l> {
         match slot {
             Slot::TIME | Slot::COUNT if self.stored.contains(&slot) => Variance::Time,
             slot if self.stored.contains(&slot) => Variance::State,
+            slot if self.in_rows.contains(&slot) => Variance::Time,
             Slot::STEP => Variance::Parameters,
             slot if self.layout.is_some_and(|layout| layout.params.contains(slot)) => Variance::Parameters,
             _ => Variance::Inputs,
@@ -65,6 +73,11 @@ impl<'l> Slots<'l> {
 /// The variance of each value of a function. A layout distinguishes parameters from inputs.
 pub fn variance(func: &Func, layout: Option<&Layout>) -> Vec<Variance> {
     of_ops(&func.ops, &Slots::of_func(func, layout), |_| Variance::Parameters)
+}
+
+/// The variance of each value of a step that reads these inputs from rows.
+pub fn with_rows(func: &Func, in_rows: &[Slot]) -> Vec<Variance> {
+    of_ops(&func.ops, &Slots::of_func(func, None).reading_rows(in_rows), |_| Variance::Parameters)
 }
 
 /// The variance of each of some operations. `at_least`: the least variance of the operation with this index.

@@ -55,6 +55,10 @@ pub enum Base {
     Before = 8,
     /// r9: the carried slots at its end.
     After = 9,
+    /// r14: the row of inputs.
+    Inputs = 14,
+    /// r15: the row of outputs.
+    Outputs = 15,
 }
 
 /// The last operand of an instruction.
@@ -94,6 +98,9 @@ pub mod instructions {
     pub const VCMPPD: Instruction = Instruction(1, 1, [1, 0], 0xc2);
     pub const VMOVAPD_LOAD: Instruction = Instruction(1, 1, [1, 0], 0x28);
     pub const VMOVAPD_STORE: Instruction = Instruction(1, 1, [1, 0], 0x29);
+    /// Memory operands need no alignment.
+    pub const VMOVUPD_LOAD: Instruction = Instruction(1, 1, [1, 0], 0x10);
+    pub const VMOVUPD_STORE: Instruction = Instruction(1, 1, [1, 0], 0x11);
     pub const VBROADCASTSD: Instruction = Instruction(1, 2, [1, 0], 0x19);
     /// VRNDSCALEPD in its EVEX form.
     pub const VROUNDPD: Instruction = Instruction(1, 3, [1, 0], 0x09);

@@ -7,6 +7,8 @@
 //! needs, such as outputs, are computed in the last step only. Carried slots alternate between two areas, so that a
 //! step in which a lane fails can be repeated in full, with statuses.
 //!
+//! A loop over [rows](with_rows) also reads inputs from a row and writes outputs to one in each step.
+//!
 //! ```text
 //! entry:  compute the loop invariants; copy the carried slots to the first area
 //! loop:   if this is the last step: go to final
@@ -27,12 +29,13 @@ use crate::codegen::lanes::assembler::{Assembler, Base, Vectors, instructions};
 use crate::codegen::lanes::isel::{MachineOp, NodeId, select};
 use crate::codegen::lanes::regalloc::{Home, RegisterAllocator, place_in};
 use crate::codegen::loop_plan::{LoopPlan, plan};
+use crate::ir::cfg::Rows;
 use crate::ir::hash::HashMap;
 use crate::ir::verify::{Stage, verify};
 use crate::ir::{Func, Op, Unary};
 use crate::math;
-use abi::Layout;
-use abi::lanes::{Lanes, LanesEntry};
+use abi::lanes::{FollowLanes, FollowLanesEntry, Lanes, LanesEntry};
+use abi::{Layout, Slot};
 use std::sync::Arc;
 
 /// Kind of vector.
@@ -159,7 +162,7 @@ pub fn compile(
     if !width.is_here() {
         return Err(Unsupported(format!("this processor lacks {}", width.name())));
     }
-    let Bytes { code, alignment, scratch } = bytes(func, layout, pool_len, width, vectors)?;
+    let Bytes { code, alignment, scratch } = bytes(func, layout, pool_len, width, vectors, None)?;
     let executable = Executable::new(&code, alignment)?;
     // SAFETY: `address` is the start of code with the signature of `LanesEntry`.
     let entry = unsafe { std::mem::transmute::<*const u8, LanesEntry>(executable.address()) };
@@ -168,6 +171,34 @@ pub fn compile(
     // SAFETY: the entry lives as long as the memory; `verify` has checked that every slot lies in the layout and every
     // table in the pool, indices are clamped, and `scratch` counts what the code needs beyond the block.
     Ok(unsafe { Lanes::new(entry, lanes, layout.size(), scratch, pool_len, name, Arc::new(executable)) })
+}
+
+/// Adds to the code of a step for many instances a loop over rows of inputs and outputs, for the same vectors.
+///
+/// # Errors
+/// If these vectors have no such loop.
+///
+/// # Panics
+/// As [`bytes`].
+pub fn with_rows(
+    lanes: Lanes,
+    func: &Func,
+    layout: &Layout,
+    pool_len: usize,
+    (width, vectors): (Width, usize),
+    rows: &Rows,
+) -> Result<Lanes, Unsupported> {
+    assert_eq!(lanes.width(), vectors * width.lanes(), "the same vectors");
+    let Bytes { code, alignment, scratch } = bytes(func, layout, pool_len, width, vectors, Some(rows))?;
+    let executable = Executable::new(&code, alignment)?;
+    // SAFETY: `address` is the start of code with the signature of `FollowLanesEntry`.
+    let entry = unsafe { std::mem::transmute::<*const u8, FollowLanesEntry>(executable.address()) };
+    let is_stored = |slot: &Slot| func.stores.iter().any(|(stored, _)| stored == slot);
+    let stored = rows.outputs.iter().map(is_stored).collect();
+    let (inputs, outputs) = (rows.inputs.clone(), rows.outputs.clone());
+    let code = FollowLanes { entry, inputs, outputs, stored, scratch, memory: Arc::new(executable) };
+    // SAFETY: as for the step; a row has the numbers of all lanes for each column.
+    Ok(unsafe { lanes.with_rows(code) })
 }
 
 /// Machine code of a step for many instances, not yet executable.
@@ -180,10 +211,10 @@ pub struct Bytes {
     pub scratch: usize,
 }
 
-/// Generates the code of [`compile`], for any processor that has the width.
+/// Generates the code of [`compile`] or, with rows, of [`with_rows`], for any processor that has the width.
 ///
 /// # Errors
-/// If the width has no instruction for an operation.
+/// If the width has no instruction for an operation, or no loop over rows.
 ///
 /// # Panics
 /// If the function does not verify: a mistake of an earlier pass.
@@ -193,6 +224,7 @@ pub fn bytes(
     pool_len: usize,
     width: Width,
     vectors: usize,
+    rows: Option<&Rows>,
 ) -> Result<Bytes, Unsupported> {
     verify(func, layout, pool_len, Stage::Lowered).unwrap_or_else(|fault| panic!("{fault}"));
     let own: &[Unary] = match width {
@@ -206,9 +238,10 @@ pub fn bytes(
     let func = expanded.as_ref().unwrap_or(func);
     match width.vectors_of_x64() {
         Some(own) => {
-            let (code, scratch) = generate(func, layout, own, vectors, elementary)?;
+            let (code, scratch) = generate(func, layout, own, vectors, elementary, rows)?;
             Ok(Bytes { code, alignment: 64, scratch })
         }
+        None if rows.is_some() => Err(Unsupported("pairs have no loop over rows".into())),
         None => {
             let (bytes, scratch) = FunctionCompiler::new(here()?).pairs(func, layout, vectors)?;
             Ok(Bytes { code: bytes.code, alignment: bytes.alignment as u64, scratch })
@@ -224,17 +257,33 @@ fn generate(
     width: Vectors,
     vectors: usize,
     pooled: bool,
+    rows: Option<&Rows>,
 ) -> Result<(Vec<u8>, usize), Unsupported> {
     let nodes = select(func, width, pooled)?;
     let vector = width.bytes() as usize;
-    let LoopPlan { carried, hoisted, prologue, body: body_order, last: final_order, areas, hoisted_at, end: spills_at } =
-        plan(&nodes, layout.size(), vectors * vector);
+    let LoopPlan {
+        carried,
+        recorded,
+        hoisted,
+        prologue,
+        body: body_order,
+        last: final_order,
+        areas,
+        hoisted_at,
+        end: spills_at,
+    } = plan(&nodes, layout.size(), vectors * vector, rows);
+    let column = |slot: Slot| rows.and_then(|rows| rows.inputs.iter().position(|input| *input == slot));
+    let to_row = |node: NodeId| {
+        let of = recorded.iter().filter(move |(_, recorded)| *recorded == node);
+        of.map(|(column, _)| Home { base: Base::Outputs, begin: 0, index: *column })
+    };
     let mut homes: HashMap<NodeId, Home> = HashMap::default();
     for (index, node) in nodes.nodes.iter().enumerate() {
         if let MachineOp::Load(slot) = node {
-            let home = match carried.iter().position(|(known, _)| known == slot) {
-                Some(index) => Home { base: Base::Before, begin: 0, index },
-                None => Home { base: Base::Block, begin: 0, index: slot.index() },
+            let home = match (carried.iter().position(|(known, _)| known == slot), column(*slot)) {
+                (Some(index), _) => Home { base: Base::Before, begin: 0, index },
+                (None, Some(index)) => Home { base: Base::Inputs, begin: 0, index },
+                (None, None) => Home { base: Base::Block, begin: 0, index: slot.index() },
             };
             homes.insert(NodeId(index as u32), home);
         }
@@ -244,6 +293,10 @@ fn generate(
         code.raw(&[0x48, 0x85, 0xd2]); // test rdx, rdx
         code.jump(&[0x0f, 0x84]) // jz
     };
+    if rows.is_some() {
+        code.raw(&[0x41, 0x56, 0x41, 0x57]); // push r14; push r15
+        code.raw(&[0x4d, 0x89, 0xc6, 0x4d, 0x89, 0xcf]); // mov r14, r8; mov r15, r9
+    }
     if width != Vectors::Avx512 {
         code.load_table_address();
     }
@@ -288,12 +341,14 @@ fn generate(
     let top = code.position();
     code.raw(&[0x48, 0x39, 0xd0]); // cmp rax, rdx
     let mut to_final = vec![code.jump(&[0x0f, 0x83])]; // jae
-    if !carried.is_empty() {
+    let is_loop = !carried.is_empty() || rows.is_some();
+    if is_loop {
         let to_area = |node: NodeId| {
             let of = carried.iter().enumerate().filter(|(_, (_, next))| *next == node);
-            of.map(|(index, _)| Home { base: Base::After, begin: 0, index }).collect()
+            of.map(|(index, _)| Home { base: Base::After, begin: 0, index }).chain(to_row(node)).collect()
         };
-        let carried_values: Vec<NodeId> = carried.iter().map(|(_, node)| *node).collect();
+        let all = carried.iter().map(|(_, node)| *node).chain(recorded.iter().map(|(_, node)| *node));
+        let carried_values: Vec<NodeId> = all.collect();
         let mut body = RegisterAllocator::new(&mut code, &nodes, &body_order, &homes, width, vectors, spills_at);
         if let Some(failed) = nodes.failed {
             body.pin(failed);
@@ -305,6 +360,12 @@ fn generate(
         spill_slots = spill_slots.max(body.spilled());
         code.raw(&[0x48, 0xff, 0xc0]); // inc rax
         code.raw(&[0x4d, 0x87, 0xc8]); // xchg r8, r9
+        if let Some(rows) = rows {
+            for (opcode, columns) in [(0xc6, rows.inputs.len()), (0xc7, rows.outputs.len())] {
+                code.raw(&[0x49, 0x81, opcode]); // add r14 or r15, the distance of two rows
+                code.raw(&((columns * vectors * vector) as i32).to_le_bytes());
+            }
+        }
         let again = code.jump(&[0xe9]);
         code.bind(again, top);
     }
@@ -315,13 +376,17 @@ fn generate(
         let mut homes: Vec<Home> =
             stores.map(|(slot, _)| Home { base: Base::Block, begin: 0, index: slot.index() }).collect();
         homes.extend((nodes.status == Some(node)).then_some(Home { base: Base::Statuses, begin: 0, index: 0 }));
+        homes.extend(to_row(node));
         homes
     };
     let mut body = RegisterAllocator::new(&mut code, &nodes, &final_order, &homes, width, vectors, spills_at);
     body.write(&to_block, &nodes.results().collect::<Vec<_>>());
     spill_slots = spill_slots.max(body.spilled());
-    if carried.is_empty() {
+    if !is_loop {
         code.raw(&[0x48, 0x89, 0xd0]); // mov rax, rdx
+    }
+    if rows.is_some() {
+        code.raw(&[0x41, 0x5f, 0x41, 0x5e]); // pop r15; pop r14
     }
     code.raw(&[0x48, 0xff, 0xc0, 0xc5, 0xf8, 0x77, 0xc3]); // inc rax; vzeroupper; ret
     let end = code.position();

@@ -279,6 +279,7 @@ impl<'a> RegisterAllocator<'a> {
             Place::Constant(_) if self.width == Vectors::Avx512 => {
                 self.code.vector(i::VBROADCASTSD, register, 0, place, None);
             }
+            Place::Memory(Base::Inputs, _) => self.code.vector(i::VMOVUPD_LOAD, register, 0, place, None),
             place => self.code.vector(i::VMOVAPD_LOAD, register, 0, place, None),
         }
     }
@@ -286,6 +287,8 @@ impl<'a> RegisterAllocator<'a> {
     fn store(&mut self, node: NodeId, register: u8, place: Place) {
         if self.is_mask(node) {
             self.code.mask(i::KMOVB_STORE, register, 0, place);
+        } else if let Place::Memory(Base::Outputs, _) = place {
+            self.code.vector(i::VMOVUPD_STORE, register, 0, place, None);
         } else {
             self.code.vector(i::VMOVAPD_STORE, register, 0, place, None);
         }
