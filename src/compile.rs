@@ -34,8 +34,8 @@ pub use compiler::rig::dbc_messages;
 pub use compiler::rig::{StepDerivative, bus_load, linear as linear_of};
 pub use compiler::{
     Built, Case, Changes, CompiledRig, Loaded, Options, SourceFile, Sources, adjustable, build, check,
-    check_declarations, compile, dissipation, explain, explain_in, explain_rig, explain_run, fit, linear, load,
-    quantities, rig, stepping, varying,
+    check_declarations, compile, dissipation, explain, explain_changed, explain_in, explain_rig, explain_run, fit,
+    linear, load, quantities, rig, stepping, varying,
 };
 use grammar::diagnostic::Diagnostic;
 use runtime::engine::sweep;

@@ -3,21 +3,28 @@
 //! In: a text and its name. Out: runs with the results of `fric run --json`, programs of models, reports on mistakes as
 //! strings. Files that a text names are read once, so that the text can be sent elsewhere together with them.
 
+use crate::characterise::subject::Written;
+use crate::characterise::{Extent, page, study};
 use crate::commands::sweep::{self, SweepFault, SweepRequest};
 pub use crate::commands::sweep::{Rows as SweepRows, Sent as Sweep};
+use crate::commands::{characterise, explain, linearise};
+pub use crate::compile::Ports;
 use crate::compile::{self, Built, Case, Changes, Idle, Loaded, Options, Stages};
 use crate::figure::{self, Kept};
 pub use crate::named_files::NamedFile;
 use crate::named_files::NamedFiles;
 use crate::plot::{self, Look};
 use crate::results::{self, Ran};
+use crate::terminal::Terminal;
 use crate::{equations, project, report};
 use abi::plan::Method;
 use abi::unit::Unit;
+use abi::{Instance, Slot};
 use grammar::diagnostic::Diagnostic;
-use runtime::engine::{self, Continue, Failure, Outcome, even_grid, sweep as runs};
+use runtime::engine::{self, Continue, Failure, Outcome, equilibrium, even_grid, sweep as runs};
 use runtime::record::Recording;
 use std::path::Path;
+use std::sync::Arc;
 use std::time::Instant;
 
 /// What is wrong with a text or with what was asked of it.
@@ -326,12 +333,122 @@ impl Text {
         Some(format!("{}\n{lines}\n{}", &text[..end], &text[end..]))
     }
 
+    /// The values at which a quantity of a model comes to rest while inputs are held. `inputs`: each with its values, as
+    /// many as there are points. NaN where it does not rest, or the run stops. All in SI.
+    ///
+    /// # Errors
+    /// All errors of the model and of the changes; a path that is none of it.
+    pub fn steady(
+        &self,
+        model: &str,
+        changes: &Changes,
+        quantity: &str,
+        inputs: &[(String, Vec<f64>)],
+        watch: &dyn Fn(f64) -> Continue,
+    ) -> Result<Vec<f64>, Problems> {
+        let program = self.built(model, changes)?.program;
+        let all = &program.description.quantities;
+        let slot = |path: &str| {
+            let found = all.iter().find(|known| known.path == path).map(|known| known.slot);
+            let report = || format!("there is no quantity `{path}` in `{model}`");
+            found.ok_or_else(|| Problems { report: report(), ..Problems::of(&self.loaded, &[]) })
+        };
+        let slots = inputs.iter().map(|(path, _)| slot(path)).collect::<Result<Vec<Slot>, Problems>>()?;
+        let seen = slot(quantity)?;
+        let code = compiler::codegen::tiering::on_demand(&program, Method::Adaptive, false);
+        let instance = Instance::new(Arc::new(program.description.clone()), code, &program.params);
+        let points = inputs.iter().map(|(_, values)| values.len()).max().unwrap_or(0);
+        let mut rested = Vec::with_capacity(points);
+        for point in 0..points {
+            let mut from = instance.clone();
+            for (slot, (_, values)) in slots.iter().zip(inputs) {
+                from.set(*slot, values[point.min(values.len() - 1)]);
+            }
+            from.start(0.0);
+            let found = equilibrium::settle_of(from, &[seen], REST_TOL, &mut |_| watch(point as f64 / points as f64));
+            rested.push(found.map_or(f64::NAN, |at| at.get(seen)));
+            if watch(point as f64 / points as f64).is_break() {
+                break;
+            }
+        }
+        Ok(rested)
+    }
+
+    /// What `fric explain` says of a model with changes: in words, and as JSON.
+    ///
+    /// # Errors
+    /// All errors of the model and of the changes.
+    pub fn explain(&self, model: &str, changes: &Changes) -> Result<(String, String), Problems> {
+        let mut loaded = self.loaded.clone();
+        let found = compile::explain_changed(&mut loaded, &self.sources, model, changes);
+        let found = found.map_err(|found| Problems::of(&loaded, &found))?;
+        let words = Terminal::text(|terminal| explain::tell(&found, &[], terminal));
+        Ok((words, explain::as_json(&found, &[]).to_string()))
+    }
+
+    /// The JSON of `fric linearise` of a model, or of an experiment. `at`: values at the point as texts; `time`: the
+    /// instant of an experiment in s; `rest`: where it has come to rest.
+    ///
+    /// # Errors
+    /// All errors of the model and of the changes; that there is no such point.
+    pub fn linearise(
+        &self,
+        name: &str,
+        changes: Changes,
+        ports: Ports,
+        at: &[(String, String)],
+        time: Option<f64>,
+        rest: bool,
+    ) -> Result<String, Problems> {
+        let mut loaded = self.loaded.clone();
+        let options = Options { changes: Changes { ports: Some(ports), ..changes }, ..Options::default() };
+        let found = compile::linear(&mut loaded, &self.sources, name, &options, &mut Vec::new());
+        let mut linear = found.map_err(|found| Problems::of(&loaded, &found))?;
+        let object = linearise::as_json(&mut linear, &linearise::Point { at, time, rest });
+        object.map(|object| object.to_string()).map_err(|report| Problems { report, ..Problems::of(&loaded, &[]) })
+    }
+
+    /// Runs a friction model through the standard battery, as `fric characterise` does. `set`: its arguments. Returns the
+    /// JSON and the page.
+    ///
+    /// # Errors
+    /// Why the model cannot be tested, in words.
+    pub fn characterise(&self, model: &str, set: &[(String, String)]) -> Result<(String, String), String> {
+        let mut written = Written::read(model)?;
+        for (path, value) in set {
+            written.set(path, value)?;
+        }
+        let (name, text) = self.source();
+        // The battery imports the text as if both were on the disk.
+        let folder = Path::new("out");
+        let (battery, path) = (characterise::battery_in(folder), project::relative(Path::new(&name), folder));
+        let mut files = self.files();
+        files.push((battery.clone(), path, name.clone(), text));
+        let sources = NamedFiles::new(files);
+        let subject = characterise::fitted(written, Some(Path::new(&name)), folder, &sources)?;
+        let study = study(subject, &battery, &sources, Extent::Whole)?;
+        Ok((characterise::json(&study).to_string(), page::report(&study)))
+    }
+
     /// The equations of a model in the symbols of print, a line each; empty if the text has no such model.
     pub fn equations(&self, model: &str) -> String {
         let all = self.loaded.models();
         let found = all.iter().find(|one| one.name.text == model);
         found.map_or(String::new(), |model| equations::lines(&equations::equations(model)))
     }
+}
+
+/// Relative tolerance of the search for rest.
+const REST_TOL: f64 = 1e-6;
+
+/// A curve as SVG, `wide` px wide. `x`, `y`: the names of the axes and their units. `id` makes its identifiers unique on a
+/// page.
+pub fn curve_svg(title: &str, (x, y): ([&str; 2], [&str; 2]), points: Vec<(f64, f64)>, wide: f64, id: &str) -> String {
+    let axis = |[name, unit]: [&str; 2]| plot::Axis { name: name.into(), unit: unit.into(), ..plot::Axis::default() };
+    let curve = plot::Curve { name: y[0].into(), points, ..plot::Curve::default() };
+    let panel = plot::Panel { x: axis(x), y: axis(y), curves: vec![curve], legend: false, ..plot::Panel::default() };
+    let figure = plot::Figure { title: title.into(), subtitle: String::new(), panels: vec![panel] };
+    plot::inline(&figure, &Look::default(), wide, id)
 }
 
 /// The file of the library that declares a model: its name and its text.

@@ -13,6 +13,8 @@ pub struct Terminal {
     closed: bool,
     colour: bool,
     error_colour: bool,
+    /// What was printed, for those who want it as a text.
+    kept: Option<Vec<u8>>,
 }
 
 /// How words are highlighted.
@@ -35,7 +37,15 @@ impl Terminal {
             closed: false,
             colour: wanted && io::stdout().is_terminal(),
             error_colour: wanted && io::stderr().is_terminal(),
+            kept: None,
         }
+    }
+
+    /// What `print` prints, without colour.
+    pub fn text(print: impl FnOnce(&mut Terminal)) -> String {
+        let mut terminal = Terminal { closed: false, colour: false, error_colour: false, kept: Some(Vec::new()) };
+        print(&mut terminal);
+        String::from_utf8_lossy(&terminal.kept.unwrap_or_default()).into_owned()
     }
 
     /// Whether standard output may have colour.
@@ -68,6 +78,9 @@ impl Terminal {
 
     /// Writes the contents of a file to the standard output.
     pub fn bytes(&mut self, bytes: &[u8]) {
+        if let Some(kept) = &mut self.kept {
+            return kept.extend(bytes);
+        }
         if self.closed {
             return;
         }

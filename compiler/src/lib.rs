@@ -550,6 +550,30 @@ pub fn explain(
     }
 }
 
+/// Explains a model of the root file on its own, with changes of its parameters and parts.
+///
+/// # Errors All errors of the model and of the changes.
+pub fn explain_changed(
+    loaded: &mut Loaded,
+    sources: &dyn Sources,
+    model: &str,
+    changes: &Changes,
+) -> Result<analysis::explain::Explanation, Vec<Diagnostic>> {
+    if changes.set.is_empty() {
+        return explain(loaded, sources, model);
+    }
+    let root = loaded.root();
+    let Some((model, file)) = model_of(loaded, model) else {
+        return Err(vec![Diagnostic::error("E0201", format!("there is no model `{model}` in this file"))]);
+    };
+    let mut warnings = Vec::new();
+    let given = experiment::overrides(loaded, changes, &mut warnings);
+    let overrides = given.iter().map(|change| change.override_in(root)).collect();
+    let (system, types, ()) = sound(loaded, sources, (&model, file), overrides, &mut warnings, |_, _| ())?;
+    let open = lower::lower(&system, &types, &[]).program;
+    Ok(analysis::explain::explain(&system, &types, &open, (None, &[]), &loaded.files))
+}
+
 /// Explains a model of any loaded file on its own.
 ///
 /// # Errors All errors of the model, or that there is no such model.

@@ -6,8 +6,8 @@
 >>> force = s.step(0.001)
 """
 
-from fric._fric import Batch, Stepper, __version__
-from fric._model import Model, Quantity, Run, Text, Verdict, load, loads, model
+from fric._fric import Batch, Native, Stepper, __version__
+from fric._model import Explanation, Linear, Model, Quantity, Run, Study, Text, Verdict, load, loads, model
 from fric.errors import (
     CompileError,
     Diagnostic,
@@ -22,13 +22,17 @@ __all__ = [
     "Batch",
     "CompileError",
     "Diagnostic",
+    "Explanation",
     "InternalError",
+    "Linear",
     "Model",
+    "Native",
     "Quantity",
     "RangeError",
     "Run",
     "RunError",
     "Stepper",
+    "Study",
     "Text",
     "UnitError",
     "UnknownName",

@@ -48,6 +48,83 @@ class Verdict:
         return self.holds and self.decided
 
 
+@dataclass(frozen=True, repr=False)
+class Explanation:
+    """The compiler's analysis of a model. ``str()`` is what ``fric explain`` prints."""
+
+    words: str
+    #: The object of ``fric explain --json``.
+    json: dict[str, Any]
+
+    @property
+    def equations(self) -> list[tuple[str, str]]:
+        """Left and right sides, in the order in which they are computed."""
+        return [(one["left"], one["right"]) for one in self.json["equations"]]
+
+    @property
+    def stable(self) -> dict[str, float | None]:
+        """The largest stable step of each method in s; none if it could not be found."""
+        return {one["method"]: _number(one["largest_stable_s"]) for one in self.json["steps"]}
+
+    def __str__(self) -> str:
+        return self.words
+
+    __repr__ = __str__
+
+
+class Linear:
+    """Matrices at a point: ``A, B, C, D = linear``; ``P`` and ``Q`` if parameters were named. Names in order, all in SI."""
+
+    def __init__(self, found: dict[str, Any]):
+        #: The object of ``fric linearise --json``.
+        self.json = found
+        names = {key: [one["name"] for one in found.get(key, [])] for key in ("states", "inputs", "outputs", "params")}
+        self.states, self.inputs, self.outputs, self.params = names.values()
+        rows = {"A": self.states, "B": self.states, "C": self.outputs, "D": self.outputs, "P": self.states}
+        columns = {"A": self.states, "B": self.inputs, "C": self.states, "D": self.inputs}
+
+        def matrix(name: str) -> np.ndarray:
+            shape = len(rows.get(name, self.outputs)), len(columns.get(name, self.params))
+            return np.array([[_number(x) for x in row] for row in found.get(name, [])], dtype=float).reshape(shape)
+
+        self.A, self.B, self.C, self.D, self.P, self.Q = map(matrix, "ABCDPQ")
+        #: The states at the point, and dx/dt there: 0 at an equilibrium.
+        self.x = np.array([_number(one["value"]) for one in found["states"]], dtype=float)
+        self.rates = np.array([_number(one["rate"]) for one in found["states"]], dtype=float)
+
+    @property
+    def eigenvalues(self) -> np.ndarray:
+        """Those of A; of a pair both."""
+        found = [complex(_number(one["real"]), _number(one["imaginary"])) for one in self.json["modes"]]
+        return np.array([each for one in found for each in ((one, one.conjugate()) if one.imag else (one,))], complex)
+
+    def __iter__(self) -> Any:
+        return iter((self.A, self.B, self.C, self.D))
+
+    def __repr__(self) -> str:
+        names = ", ".join(self.states), ", ".join(self.inputs), ", ".join(self.outputs)
+        return f"<fric.Linear of states ({names[0]}), inputs ({names[1]}), outputs ({names[2]})>"
+
+
+class Study:
+    """A friction model's measured behaviour: ``json`` as ``fric characterise --json``; a notebook shows the page."""
+
+    def __init__(self, found: dict[str, Any], page: str):
+        self.json, self.page = found, page
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Writes the page, a file of HTML that needs no other."""
+        with open(path, "w", encoding="utf-8") as file:
+            file.write(self.page)
+
+    def _repr_html_(self) -> str:
+        # The page has styles of its own.
+        return f'<iframe srcdoc="{_html.escaped(self.page)}" style="width:100%;height:40em;border:0" sandbox></iframe>'
+
+    def __repr__(self) -> str:
+        return f"<fric.Study of {self.json.get('model', 'a model')}>"
+
+
 class Text:
     """A text of the language with its models and experiments. Made by :func:`load` and :func:`loads`."""
 
@@ -318,8 +395,8 @@ class Model:
         """Runs the model on its own.
 
         ``inputs``: for each input a number in SI, a text of the language (``"1 N * sin(2 rad/s * t)"``), or a pair of
-        arrays (t, values) in SI: straight lines between them, whose corners an adaptive run meets exactly, or with
-        ``hold`` values that stay until the next one. ``outputs``: expressions to record; else all outputs and states.
+        arrays (t, values) in SI: straight lines between them, or with ``hold`` values that stay until the next one; an adaptive
+        run meets their corners and jumps exactly. ``outputs``: expressions to record; else all outputs and states.
         Further options are those of :meth:`Text.runs`.
         """
         given = dict(inputs or {})
@@ -349,8 +426,10 @@ class Model:
         data = ""
         if series:
             times, columns = _merged(series)
-            # Held values change by a slope that is steep and has no corner to meet.
-            corners = [] if hold else times.tolist()
+            # A held value jumps at its instant: a step ends there with the value before, and the next one begins with the
+            # new one.
+            jumps = [np.asarray(value[0], dtype=float) for value in given.values() if isinstance(value, tuple)]
+            corners = np.unique(np.concatenate(jumps)).tolist() if hold else times.tolist()
             heads = [f"c{k} [{self.inputs[path].si or '1'}]" for k, path in enumerate(columns)]
             table = ";".join(["t [s]", *(head.replace(" [1]", "") for head in heads)])
             lines = [table] + [
@@ -371,6 +450,106 @@ class Model:
         made = Text(_fric.Text(name, body, files))
         return made.run(experiment, set=values, solver=solver, step=step, tol=tol, _corners=corners, **how)
 
+    def explain(self) -> Explanation:
+        """What ``fric explain`` says: quantities, order of equations, states, costs and largest stable steps."""
+        words, found = self._text._inner.explain(self.name, self._settings())
+        return Explanation(words, json.loads(found))
+
+    def linearise(
+        self,
+        at: Mapping[str, Any] | None = None,
+        *,
+        inputs: Sequence[str] | None = None,
+        outputs: Sequence[str] | None = None,
+        params: Sequence[str] | None = None,
+        rest: bool = False,
+    ) -> Linear:
+        """The matrices of the model at a point, as ``fric linearise``: dx = A x + B u, y = C x + D u around it, in SI.
+
+        ``at``: states, inputs, parameters and regimes there, ``{"v": "1 mm/s", "fr": "stick"}``; all others as at the
+        start, or with ``rest`` where the model comes to rest. ``inputs``, ``outputs``: names; else those of the model.
+        ``params``: P and Q are the derivatives with respect to these.
+        """
+        known = {quantity.path: quantity for _, quantity in self._quantities}
+
+        def text(path: str, value: Any) -> str:
+            quantity = known.get(path)
+            if quantity is not None:
+                return _values.written(path, value, quantity.si, quantity.boolean)
+            if not isinstance(value, str):
+                raise unknown("state, input or parameter", path, list(known))
+            # The regime of a part.
+            return value
+
+        given = [(path, text(path, value)) for path, value in (at or {}).items()]
+        names = [_names("inputs", inputs) or [], _names("outputs", outputs) or [], _names("params", params) or []]
+        return Linear(json.loads(self._text._inner.linearise(self.name, self._settings(), *names, given, None, rest)))
+
+    def curve(
+        self,
+        output: str,
+        over: str,
+        values: str | Sequence[float] | np.ndarray,
+        *,
+        points: int = 201,
+        **held: Any,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Where an output comes to rest while an input is held at each of some values: the steady curve, in SI.
+
+        ``values``: an array, or a range such as ``"-5 mm/s .. 5 mm/s"`` with ``points`` of them. ``held``: values of other
+        inputs; 0 else. NaN where the output does not come to rest.
+        """
+        for path in (over, *held):
+            if path not in self.inputs:
+                raise unknown("input", path, list(self.inputs))
+        if isinstance(values, str):
+            low, dots, high = values.partition("..")
+            if not dots:
+                raise ValueError(f'values: a range such as "-5 mm/s .. 5 mm/s" is needed, not {values!r}')
+            ends = [_values.number(over, end.strip(), self.inputs[over].si) for end in (low, high)]
+            x = np.linspace(ends[0], ends[1], points)
+        else:
+            x = np.asarray(values, dtype=float).ravel()
+        others = {path: 0.0 for path in self.inputs if path != over} | held
+        inputs = [(over, x.tolist())] + [
+            (path, [_values.number(path, value, self.inputs[path].si, self.inputs[path].boolean)])
+            for path, value in others.items()
+        ]
+        if x.size == 0:
+            return x, x.copy()
+        if not np.isfinite(x).all():
+            raise ValueError(f"values: those of `{over}` must be finite")
+        if output not in self.outputs and output not in self.states:
+            raise unknown("output", output, [*self.outputs, *self.states])
+        return x, self._text._inner.steady(self.name, self._settings(), output, inputs)
+
+    def characterise(self) -> Study:
+        """Runs a friction model (an input ``v`` and an output ``F``) through the standard battery of experiments."""
+        found, page = self._text._inner.characterise(self.name, list(self._values.items()))
+        return Study(json.loads(found), page)
+
+    def _steady_svg(self) -> str:
+        """The steady curve of a friction model; empty for others."""
+        if "v" not in self.inputs or "F" not in self.outputs:
+            return ""
+        speed = self.inputs["v"].si
+        scales = [
+            quantity.default
+            for quantity in self.params.values()
+            if quantity.si == speed and quantity.default is not None and 0 < quantity.default < np.inf
+        ]
+        most = 5 * max(scales) if scales else 0.05
+        try:
+            x, y = self.curve("F", "v", np.linspace(-most, most, 121))
+        except (ValueError, RuntimeError):
+            # A model that cannot stand alone has no such curve; its equations are shown all the same.
+            return ""
+        if not np.isfinite(y).any():
+            return ""
+        points = list(zip(x.tolist(), y.tolist()))
+        axes = ("v", speed), ("F", self.outputs["F"].si)
+        return _fric.curve_svg(f"{self.name}, steady", *axes, points, 560, _html.identifier())
+
     def _repr_html_(self) -> str:
         rows = [
             (
@@ -383,7 +562,8 @@ class Model:
             for kind, quantity in self._quantities
         ]
         table = _html.table(("", "name", "unit", "value", ""), rows)
-        return f"<h4>{_html.escaped(self.name)}</h4><pre>{_html.escaped(self.equations)}</pre>{table}"
+        head = f"<h4>{_html.escaped(self.name)}</h4><pre>{_html.escaped(self.equations)}</pre>"
+        return head + self._steady_svg() + table
 
     def __repr__(self) -> str:
         values = ", ".join(f"{path} = {value}" for path, value in self._values.items())
@@ -532,6 +712,14 @@ class Run:
         variables = {label: variable(label, self[label]) for label in self.keys()}
         time = xarray.Variable("time", self.t, {"units": "s"})
         return xarray.Dataset(variables, coords={"time": time})
+
+    def __arrow_c_stream__(self, requested_schema: object = None) -> Any:
+        """The columns in SI for pyarrow, polars and DuckDB, without a copy: ``t [s]``, ``x [m]``."""
+        columns = [("t [s]", self.t)]
+        for label, unit in self.units.items():
+            si = _fric.si_unit(unit)
+            columns.append((f"{label} [{si}]" if si else label, self[label]))
+        return _fric.arrow_stream(columns)
 
     def svg(self, width: float = 860) -> str:
         """The plots of the experiment as SVG; empty if it has none."""

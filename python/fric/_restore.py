@@ -28,3 +28,21 @@ def stepper(
     made = _fric.Stepper(_fric.Text(*source), model, values, method, step, inputs, outputs, interpret)
     made.restore(block)
     return made
+
+
+def batch(
+    source: tuple[str, str, list[tuple[str, str, str, str]]],
+    model: str,
+    sets: list[dict[str, str]],
+    which: list[int],
+    how: tuple[str, float, bool],
+    inputs: list[str],
+    outputs: list[str],
+    threads: int,
+    state: tuple[bytes, list[tuple[int, int, bytes]]],
+) -> _fric.Batch:
+    """Many running instances."""
+    method, step, interpret = how
+    made = _fric.Batch(_fric.Text(*source), model, sets, which, method, step, inputs, outputs, threads, interpret)
+    made.restore(*state)
+    return made

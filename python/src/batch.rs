@@ -12,13 +12,16 @@ use compiler::numerics::fixed_step::widened;
 use numpy::PyArrayMethods;
 use pyo3::exceptions::{PyTypeError, PyValueError};
 use pyo3::prelude::*;
+use pyo3::types::{PyBytes, PyDict, PyTuple};
 use runtime::engine;
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 /// Rows of a tile: what is transposed at once, so that it stays in the nearest cache.
 const TILE: usize = 64;
 
 /// Instances that are stepped together.
+#[derive(Clone)]
 enum Group {
     /// In the lanes of vectors; those beyond the number of instances repeat the last one.
     Lanes(Box<abi::lanes::Batch>),
@@ -31,6 +34,7 @@ type Stopped = Option<(u64, Vec<f64>)>;
 
 /// Many running instances of a model.
 #[pyclass(module = "fric._fric")]
+#[derive(Clone)]
 pub struct Batch {
     plan: Arc<Plan>,
     template: Instance,
@@ -39,12 +43,15 @@ pub struct Batch {
     threads: usize,
     groups: Vec<Group>,
     stopped: Vec<Stopped>,
-    /// Started blocks and ranges, one for each set of parameters, and the set of each instance.
+    /// Started blocks and ranges, one for each set of parameters, the sets, and that of each instance.
+    sets: Vec<BTreeMap<String, String>>,
     blocks: Vec<Vec<f64>>,
     guards: Vec<Vec<Guard>>,
     starts: Vec<u32>,
     /// Guards whose range depends on the set: the code watches a range that holds for all.
     varied: Vec<usize>,
+    /// What each step records: the outputs, and the slots of these guards.
+    columns: Vec<Slot>,
 }
 
 /// What a worker needs besides its groups.
@@ -52,6 +59,8 @@ pub struct Batch {
 struct Job<'a> {
     inputs: &'a [Slot],
     outputs: &'a [Slot],
+    /// The columns of a tile: the outputs, then what is watched.
+    columns: &'a [Slot],
     pool: &'a [f64],
     /// Of the rows of inputs: numbers from one instance to the next, and from one row to the next; 0: held.
     per_instance: usize,
@@ -114,26 +123,29 @@ impl Job<'_> {
         taken: &mut [f64],
     ) {
         let (width, n, m) = (batch.width(), self.inputs.len(), self.outputs.len());
-        let all: Vec<Slot> = self.outputs.iter().copied().chain(self.watched.iter().map(|guard| guard.slot)).collect();
-        let wide = all.len();
+        let wide = self.columns.len();
         // Lanes beyond the instances, and those that have stopped, move with numbers that are sound.
         let used = stopped.len();
-        let mut into = vec![0.0; TILE * n * width];
-        let mut out = vec![0.0; TILE * wide * width];
+        let most = TILE.min(self.rows);
+        let mut into = vec![0.0; most * n * width];
+        let mut out = vec![0.0; most * wide * width];
+        // The row in a tile from which on an instance has no results, and whether it ran at the begin of the tile.
+        let mut ends = vec![0; used];
+        let mut runs = vec![true; used];
+        let mut again = vec![false; width];
         for begin in (0..self.rows).step_by(TILE) {
             let rows = TILE.min(self.rows - begin);
-            for lane in 0..width {
-                let of = &given[lane.min(used - 1) * self.per_instance..];
-                for row in 0..rows {
-                    let from = &of[(begin + row) * self.per_row..][..n];
-                    from.iter().enumerate().for_each(|(k, x)| into[(row * n + k) * width + lane] = *x);
-                }
+            if begin == 0 || self.per_row > 0 {
+                let of = |lane: usize| &given[lane.min(used - 1) * self.per_instance + begin * self.per_row..];
+                let tile = &mut into[..rows * n * width];
+                (0..width).for_each(|lane| self.give_lane(of(lane), tile, (lane, width)));
             }
-            let (from, to) = ((self.inputs, &into[..rows * n * width]), (&all[..], &mut out[..rows * wide * width]));
-            // The row in this tile from which on an instance has no results.
-            let mut ends: Vec<usize> = stopped.iter().map(|stop| if stop.is_some() { 0 } else { rows }).collect();
-            let runs: Vec<bool> = stopped.iter().map(Option::is_none).collect();
-            let mut again = vec![false; width];
+            let into = &into[..rows * n * width];
+            let (from, to) = ((self.inputs, into), (self.columns, &mut out[..rows * wide * width]));
+            for (lane, stop) in stopped.iter().enumerate() {
+                (ends[lane], runs[lane]) = (if stop.is_some() { 0 } else { rows }, stop.is_none());
+            }
+            again.fill(false);
             batch.follow(self.pool, from, to, rows, &mut |row, batch| {
                 for lane in (0..width).filter(|lane| batch.status(*lane) != 0) {
                     again[lane] = true;
@@ -145,7 +157,7 @@ impl Job<'_> {
                     }
                 }
             });
-            for lane in (0..runs.len()).filter(|lane| runs[*lane] && !self.watched.is_empty()) {
+            for lane in (0..used).filter(|lane| runs[*lane] && !self.watched.is_empty()) {
                 let value = |row: usize, k: usize| out[(row * wide + k) * width + lane];
                 let first = |row: usize| Some((row, self.violated(starts[lane], |k| value(row, m + k))?));
                 if let Some((row, guard)) = (0..ends[lane]).find_map(first) {
@@ -153,7 +165,7 @@ impl Job<'_> {
                     batch.save(lane, &mut block);
                     // As it was after that step, as far as it is known.
                     block[Slot::COUNT.index()] -= (rows - row - 1) as f64;
-                    all.iter().enumerate().for_each(|(k, slot)| block[slot.index()] = value(row, k));
+                    self.columns.iter().enumerate().for_each(|(k, slot)| block[slot.index()] = value(row, k));
                     (stopped[lane], ends[lane], again[lane]) = (Some((guard as u64 + 1, block)), row, true);
                 }
             }
@@ -161,12 +173,46 @@ impl Job<'_> {
                 batch.load(lane, self.template.block());
             }
             for (lane, end) in ends.iter().enumerate() {
-                for row in (0..rows).filter(|row| (begin + row + 1).is_multiple_of(self.every)) {
-                    let to = &mut taken[lane * self.size() + (begin + row) / self.every * m..][..m];
-                    for (k, x) in to.iter_mut().enumerate() {
-                        *x = if row < *end { out[(row * wide + k) * width + lane] } else { f64::NAN };
-                    }
+                let to = &mut taken[lane * self.size() + begin / self.every * m..];
+                self.take_lane(&out[..rows * wide * width], to, (lane, width), begin, *end);
+            }
+        }
+    }
+
+    /// Copies rows of inputs of an instance to its lane of a tile. `of`: from the first row on.
+    fn give_lane(&self, of: &[f64], tile: &mut [f64], (lane, width): (usize, usize)) {
+        let n = self.inputs.len();
+        match (n, self.per_row) {
+            (0, _) => {}
+            (1, 1) => tile.chunks_exact_mut(width).zip(of).for_each(|(row, x)| row[lane] = *x),
+            (_, 0) => {
+                for row in tile.chunks_exact_mut(n * width) {
+                    row.chunks_exact_mut(width).zip(of).for_each(|(column, x)| column[lane] = *x);
                 }
+            }
+            _ => {
+                for (row, of) in tile.chunks_exact_mut(n * width).zip(of.chunks(self.per_row)) {
+                    row.chunks_exact_mut(width).zip(of).for_each(|(column, x)| column[lane] = *x);
+                }
+            }
+        }
+    }
+
+    /// Copies the rows of outputs that are due from a lane of a tile to the results of its instance; NaN from row `end` on.
+    /// `begin`: the number of the first row of the tile.
+    fn take_lane(&self, tile: &[f64], to: &mut [f64], (lane, width): (usize, usize), begin: usize, end: usize) {
+        let (m, wide) = (self.outputs.len(), self.columns.len());
+        if self.every == 1 && wide == 1 {
+            let rows = tile.len() / width;
+            to.iter_mut().zip(tile.chunks_exact(width)).for_each(|(x, row)| *x = row[lane]);
+            to[end..rows].fill(f64::NAN);
+            return;
+        }
+        let rows = tile.chunks_exact(wide * width).enumerate();
+        let due = rows.filter(|(row, _)| (begin + row + 1).is_multiple_of(self.every));
+        for ((row, of), to) in due.zip(to.chunks_exact_mut(m)) {
+            for (x, column) in to.iter_mut().zip(of.chunks_exact(width)) {
+                *x = if row < end { column[lane] } else { f64::NAN };
             }
         }
     }
@@ -229,7 +275,7 @@ impl Batch {
         py: Python,
         text: Py<crate::text::Text>,
         model: &str,
-        sets: Vec<std::collections::BTreeMap<String, String>>,
+        sets: Vec<BTreeMap<String, String>>,
         which: Vec<usize>,
         solver: &str,
         step: f64,
@@ -259,9 +305,16 @@ impl Batch {
         }
         let (common, varied) = common(&guards);
         let (program, template) = first.guarded_by(&common);
+        let slots = |all: &[(String, Slot)]| all.iter().map(|(_, slot)| *slot).collect::<Vec<Slot>>();
+        let inputs = slots(&first.plan.inputs);
+        let mut columns = slots(&first.plan.outputs);
+        columns.extend(varied.iter().map(|guard| common[*guard].slot));
         let lanes: Option<Lanes> = match interpret {
             true => None,
-            false => guarded(py, || py.detach(|| tiering::lanes(&program, first.plan.method)))?,
+            false => {
+                let made = || tiering::lanes_on_rows(&program, first.plan.method, &inputs, &columns);
+                guarded(py, || py.detach(made))?
+            }
         };
         let width = lanes.as_ref().map_or(8, Lanes::width);
         let group = |which: &[usize]| match &lanes {
@@ -286,7 +339,22 @@ impl Batch {
         let groups = which.chunks(width).map(group).collect();
         let starts = which.iter().map(|set| *set as u32).collect();
         let stopped = (0..len).map(|_| None).collect();
-        Ok(Batch { plan: first.plan, template, width, len, threads, groups, stopped, blocks, guards, starts, varied })
+        let plan = first.plan;
+        Ok(Batch {
+            plan,
+            template,
+            width,
+            len,
+            threads,
+            groups,
+            stopped,
+            sets,
+            blocks,
+            guards,
+            starts,
+            varied,
+            columns,
+        })
     }
 
     /// A step of each instance with its row of inputs; returns a row of outputs for each.
@@ -436,6 +504,77 @@ impl Batch {
         Ok(())
     }
 
+    /// A second batch that continues from the same states.
+    fn copy(&self) -> Batch {
+        self.clone()
+    }
+
+    fn __copy__(&self) -> Batch {
+        self.clone()
+    }
+
+    fn __deepcopy__(&self, _memo: &Bound<PyDict>) -> Batch {
+        self.clone()
+    }
+
+    /// What `fric._restore.batch` needs to make the same batch elsewhere.
+    fn __reduce__<'py>(&self, py: Python<'py>) -> PyResult<(Bound<'py, PyAny>, Bound<'py, PyTuple>)> {
+        let mut blocks = Vec::new();
+        let mut block = self.template.block().to_vec();
+        for index in 0..self.len {
+            match &self.groups[index / self.width] {
+                Group::Lanes(batch) => batch.save(index % self.width, &mut block),
+                Group::Alone(instances) => block.copy_from_slice(instances[index % self.width].block()),
+            }
+            blocks.extend(block.iter().flat_map(|x| x.to_le_bytes()));
+        }
+        let bytes = |block: &[f64]| block.iter().flat_map(|x| x.to_le_bytes()).collect::<Vec<u8>>();
+        let mut stopped = Vec::new();
+        for (index, stop) in self.stopped.iter().enumerate() {
+            if let Some((status, block)) = stop {
+                stopped.push((index, *status, PyBytes::new(py, &bytes(block))));
+            }
+        }
+        let which: Vec<u32> = self.starts.clone();
+        let state = (PyBytes::new(py, &blocks), stopped);
+        let rest = (
+            self.plan.source(py)?,
+            &self.plan.model,
+            self.sets.clone(),
+            which,
+            self.plan.how(),
+            names_of(&self.plan.inputs),
+            names_of(&self.plan.outputs),
+            self.threads,
+            state,
+        );
+        Ok((raise::function(py, "batch")?, rest.into_pyobject(py)?))
+    }
+
+    /// Continues from the blocks of another batch of the same model.
+    fn restore(&mut self, blocks: &[u8], stopped: Vec<(usize, u64, Vec<u8>)>) -> PyResult<()> {
+        let size = self.template.block().len();
+        let numbers = crate::stepper::doubles_of(blocks);
+        let ends: Vec<(usize, u64, Vec<f64>)> =
+            stopped.iter().map(|(index, status, block)| (*index, *status, crate::stepper::doubles_of(block))).collect();
+        let fits = ends.iter().all(|(index, _, block)| *index < self.len && block.len() == size);
+        if numbers.len() != self.len * size || !fits {
+            return Err(PyValueError::new_err(
+                "this batch was stored by another version of fric, whose models have another layout",
+            ));
+        }
+        for (index, block) in numbers.chunks_exact(size).enumerate() {
+            match &mut self.groups[index / self.width] {
+                Group::Lanes(batch) => batch.load(index % self.width, block),
+                Group::Alone(instances) => instances[index % self.width].block_mut().copy_from_slice(block),
+            }
+        }
+        for (index, status, block) in ends {
+            self.stopped[index] = Some((status, block));
+        }
+        Ok(())
+    }
+
     /// Names of the columns of inputs.
     #[getter]
     fn inputs(&self) -> Vec<&str> {
@@ -525,6 +664,7 @@ impl Batch {
         let job = Job {
             inputs: &inputs,
             outputs: &outputs,
+            columns: &self.columns,
             pool: &description.pool,
             per_instance: per.0,
             per_row: per.1,

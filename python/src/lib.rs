@@ -6,8 +6,10 @@
 
 mod raise;
 mod arrays;
+mod arrow;
 mod watched;
 mod text;
+mod native;
 mod stepper;
 mod batch;
 
@@ -27,9 +29,11 @@ mod _fric {
     #[pymodule_export]
     use crate::batch::Batch;
     #[pymodule_export]
+    use crate::native::Native;
+    #[pymodule_export]
     use crate::stepper::Stepper;
     #[pymodule_export]
-    use crate::text::{Run, Text};
+    use crate::text::{Run, Text, arrow_stream};
     use abi::unit::Unit;
     use numpy::PyArrayMethods;
     use pyo3::exceptions::PyValueError;
@@ -69,6 +73,19 @@ mod _fric {
     #[pyfunction]
     fn si_unit(unit: &str) -> PyResult<String> {
         Ok(Unit::si(crate::unit(unit)?.dimension).text)
+    }
+
+    /// A curve as SVG. `x`, `y`: name and unit of the axes.
+    #[pyfunction]
+    fn curve_svg(
+        title: &str,
+        x: (String, String),
+        y: (String, String),
+        points: Vec<(f64, f64)>,
+        wide: f64,
+        id: &str,
+    ) -> String {
+        fric::embed::curve_svg(title, ([&x.0, &x.1], [&y.0, &y.1]), points, wide, id)
     }
 
     /// Values in SI as numbers in a unit.

@@ -1,25 +1,23 @@
 //! Running instances: fixed steps of a model on its own, with its inputs from outside.
 
+use crate::native::Native;
 use crate::text::{Text, method};
-use crate::watched::guarded;
+use crate::watched::{guarded, in_parts};
 use crate::{arrays, raise};
 use abi::description::{Guard, Kind, Quantity};
 use abi::follow::{Follow, Rows, RowsMut};
 use abi::plan::Method;
-use abi::{Description, Function, Instance, Slot};
-use compiler::codegen::tiering;
+use abi::{Code, Description, Function, Instance, Slot};
+use compiler::Changes;
+use compiler::codegen::tiering::{self, Policy};
 use compiler::ir::program::Program;
-use compiler::{Built, Changes};
 use numpy::PyArrayMethods;
-use pyo3::exceptions::{PyTypeError, PyValueError};
+use pyo3::exceptions::{PyRuntimeError, PyTypeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyDict, PyFloat, PyTuple};
 use runtime::engine;
 use std::collections::BTreeMap;
 use std::sync::Arc;
-
-/// Steps in one call from which on other threads may run meanwhile: some 10 µs.
-const LONG: u64 = 1000;
 
 /// What does not change while it runs.
 pub struct Plan {
@@ -34,6 +32,35 @@ pub struct Plan {
     pub inputs: Vec<(String, Slot)>,
     /// Those of the results.
     pub outputs: Vec<(String, Slot)>,
+}
+
+/// An argument that may be left out. The first ones of a call are taken without making a tuple of them.
+struct Given<'a, 'py>(Option<Borrowed<'a, 'py, PyAny>>);
+
+impl<'a, 'py> FromPyObject<'a, 'py> for Given<'a, 'py> {
+    type Error = PyErr;
+
+    fn extract(given: Borrowed<'a, 'py, PyAny>) -> PyResult<Given<'a, 'py>> {
+        Ok(Given(Some(given)))
+    }
+}
+
+impl Plan {
+    /// Its text and the files that it names, for pickling.
+    pub fn source<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyTuple>> {
+        let (name, source) = self.text.get().source_text();
+        (name, source, self.text.get().named_files()).into_pyobject(py)
+    }
+
+    /// Its method, length of a step in s, and whether it is interpreted.
+    pub fn how(&self) -> (&'static str, f64, bool) {
+        (self.method.name(), self.step, self.interpret)
+    }
+}
+
+/// Numbers that were stored as bytes.
+pub fn doubles_of(bytes: &[u8]) -> Vec<f64> {
+    bytes.chunks_exact(8).map(|bytes| f64::from_le_bytes(bytes.try_into().expect("eight bytes"))).collect()
 }
 
 /// A started instance.
@@ -60,13 +87,47 @@ pub struct Stepper {
     status: u64,
 }
 
-/// A program with the code of its steps, started.
-fn started(built: Built, method: Method, step: f64, interpret: bool) -> (Arc<Program>, Instance, u64) {
-    let mut program = built.program;
+/// A program whose delays have room for steps of this length.
+fn sized(mut program: Program, step: f64) -> Program {
     if !program.description.delays.is_empty() {
         program.size_rings(step);
     }
-    let code = tiering::on_demand(&program, method, interpret);
+    program
+}
+
+/// Code of steps that are called one by one: interpreted until compiling pays, and then compiled at once, so that a loop of
+/// calls runs on machine code after a known number of steps. Long programs are compiled by another thread meanwhile.
+fn stepping(program: &Program, method: Method, interpret: bool) -> Code {
+    let len = program.derivatives.ops.len() + program.outputs.ops.len();
+    match interpret || compiler::codegen::target::here().is_err() || len > MOST_AT_ONCE {
+        true => tiering::on_demand(program, method, interpret),
+        false => tiering::tiered(program, method, Policy { in_background: false, ..Policy::USUAL }),
+    }
+}
+
+/// Operations of a program that is compiled within some 10 ms.
+const MOST_AT_ONCE: usize = 1000;
+
+/// Whether programs differ in values of parameters alone, so that the code of one serves the other.
+fn is_same_code(a: &Program, b: &Program) -> bool {
+    let bits = |of: &Program| of.description.pool.iter().map(|x| x.to_bits()).collect::<Vec<_>>();
+    let funcs = |of: &Program| {
+        let optional = [&of.tick, &of.transitions, &of.roots].map(Clone::clone);
+        (of.start.clone(), of.outputs.clone(), of.derivatives.clone(), optional)
+    };
+    let (one, other) = (&a.description, &b.description);
+    same_slots(a, b)
+        && one.quantities == other.quantities
+        && one.guards == other.guards
+        && one.ticks == other.ticks
+        && one.delays == other.delays
+        && bits(a) == bits(b)
+        && funcs(a) == funcs(b)
+}
+
+/// A program with the code of its steps, started.
+fn started(program: Program, method: Method, step: f64, interpret: bool) -> (Arc<Program>, Instance, u64) {
+    let code = stepping(&program, method, interpret);
     let mut instance = Instance::new(Arc::new(program.description.clone()), code, &program.params);
     let status = instance.start(step);
     (Arc::new(program), instance, status)
@@ -93,7 +154,7 @@ impl Started {
             return Err(raise::range(py, &format!("step: {step} s is no length of a step; it must be above 0")));
         }
         let built = text.get().built(py, model, changes(set, method, step))?;
-        let (program, instance, status) = guarded(py, || started(built, method, step, interpret))?;
+        let (program, instance, status) = guarded(py, || started(sized(built.program, step), method, step, interpret))?;
         let all = &program.description.quantities;
         let of = |kind: Kind| all.iter().filter(move |q| q.kind == kind).map(|q| q.path.clone()).collect();
         let inputs = inputs.unwrap_or_else(|| of(Kind::Input));
@@ -114,7 +175,31 @@ impl Started {
     pub fn again(py: Python, plan: &Arc<Plan>, set: &BTreeMap<String, String>) -> PyResult<Started> {
         let Plan { method, step, interpret, ref model, ref text, .. } = **plan;
         let built = text.get().built(py, model, changes(set, method, step))?;
-        let (program, instance, status) = guarded(py, || started(built, method, step, interpret))?;
+        let (program, instance, status) = guarded(py, || started(sized(built.program, step), method, step, interpret))?;
+        Ok(Started { plan: plan.clone(), program, instance, status })
+    }
+
+    /// Starts the same model with other parameters, by the code of a running instance if that is the same.
+    fn like(
+        py: Python,
+        plan: &Arc<Plan>,
+        set: &BTreeMap<String, String>,
+        program: &Program,
+        instance: &Instance,
+    ) -> PyResult<Started> {
+        let Plan { method, step, interpret, ref model, ref text, .. } = **plan;
+        let built = text.get().built(py, model, changes(set, method, step))?;
+        let begin = || {
+            let made = sized(built.program, step);
+            if !is_same_code(&made, program) {
+                return started(made, method, step, interpret);
+            }
+            let mut instance = instance.clone();
+            instance.block_mut()[made.description.layout.params.range()].copy_from_slice(&made.params);
+            let status = instance.start(step);
+            (Arc::new(made), instance, status)
+        };
+        let (program, instance, status) = guarded(py, begin)?;
         Ok(Started { plan: plan.clone(), program, instance, status })
     }
 
@@ -213,20 +298,41 @@ impl Stepper {
     }
 
     /// One step with these inputs; returns the outputs.
-    #[pyo3(signature = (*inputs))]
-    fn step<'py>(&mut self, inputs: &Bound<'py, PyTuple>) -> PyResult<Bound<'py, PyAny>> {
-        self.give(inputs)?;
+    #[pyo3(
+        signature = (first=Given(None), second=Given(None), third=Given(None), fourth=Given(None), /, *rest),
+        text_signature = "($self, *inputs)"
+    )]
+    fn step<'py>(
+        &mut self,
+        first: Given<'_, 'py>,
+        second: Given<'_, 'py>,
+        third: Given<'_, 'py>,
+        fourth: Given<'_, 'py>,
+        rest: &Bound<'py, PyTuple>,
+    ) -> PyResult<Bound<'py, PyAny>> {
+        self.give([first, second, third, fourth], rest)?;
         self.status = self.instance.advance(1);
-        self.results(inputs.py())
+        self.results(rest.py())
     }
 
     /// Steps under held inputs; returns the last outputs.
-    #[pyo3(signature = (count, *inputs))]
-    fn hold<'py>(&mut self, count: u64, inputs: &Bound<'py, PyTuple>) -> PyResult<Bound<'py, PyAny>> {
-        self.give(inputs)?;
-        let py = inputs.py();
+    #[pyo3(
+        signature = (count, first=Given(None), second=Given(None), third=Given(None), fourth=Given(None), /, *rest),
+        text_signature = "($self, count, /, *inputs)"
+    )]
+    fn hold<'py>(
+        &mut self,
+        count: u64,
+        first: Given<'_, 'py>,
+        second: Given<'_, 'py>,
+        third: Given<'_, 'py>,
+        fourth: Given<'_, 'py>,
+        rest: &Bound<'py, PyTuple>,
+    ) -> PyResult<Bound<'py, PyAny>> {
+        self.give([first, second, third, fourth], rest)?;
+        let py = rest.py();
         let instance = &mut self.instance;
-        self.status = if count < LONG { instance.advance(count) } else { py.detach(|| instance.advance(count)) };
+        self.status = in_parts(py, count, |_, some| (some, instance.advance(some)))?.1;
         self.results(py)
     }
 
@@ -248,24 +354,28 @@ impl Stepper {
         let (instance, status) = (&mut self.instance, &mut self.status);
         let given = given.as_slice().map_err(|error| PyValueError::new_err(error.to_string()))?;
         let mut go = |numbers: &mut [f64]| {
-            let (to, rows) = (RowsMut { numbers, stride: m }, Rows { numbers: given, stride: n });
-            let work = || instance.follow(&follow, rows, to, count as u64);
-            let done = if (count as u64) < LONG { work() } else { py.detach(work) };
+            let part = |done: u64, some: u64| {
+                let done = done as usize;
+                let (from, to) = (&given[done * n..], &mut numbers[done * m..]);
+                let (rows, to) = (Rows { numbers: from, stride: n }, RowsMut { numbers: to, stride: m });
+                instance.follow(&follow, rows, to, some)
+            };
+            let done = in_parts(py, count as u64, part)?;
             *status = done.1;
-            done
+            PyResult::Ok(done)
         };
         let shape = |rows: usize| if m > 1 { vec![rows, m] } else { vec![rows] };
         if let Some(out) = out {
             let array = arrays::target(&out, &shape(count))?;
             let mut write = array.try_readwrite().map_err(|error| PyValueError::new_err(format!("out: {error}")))?;
             let numbers = write.as_slice_mut().map_err(|error| PyValueError::new_err(format!("out: {error}")))?;
-            let (_, status) = go(numbers);
+            let (_, status) = go(numbers)?;
             drop(write);
             checked(py, &self.instance, status, None)?;
             return Ok(out);
         }
         let mut numbers = vec![0.0; count * m];
-        let (done, status) = go(&mut numbers);
+        let (done, status) = go(&mut numbers)?;
         numbers.truncate(done as usize * m);
         let array = arrays::array(py, numbers, Some(&shape(done as usize)))?;
         checked(py, &self.instance, status, Some(&array))?;
@@ -381,6 +491,20 @@ impl Stepper {
         checked(py, &self.instance, self.status, None)
     }
 
+    /// The step as machine code, for callers such as numba: its address, a copy of the block, and where quantities are.
+    #[getter]
+    fn ctypes(&self, py: Python) -> PyResult<Native> {
+        let (program, method) = (self.program.clone(), self.plan.method);
+        let made = || {
+            let mut functions = tiering::functions(&program, method);
+            functions.retain(|(function, _)| *function == Function::Step);
+            let description = &program.description;
+            compiler::codegen::jit::compile(&functions, &description.layout, description.pool.len())
+        };
+        let (machine, _) = guarded(py, || py.detach(made))?.map_err(|why| PyRuntimeError::new_err(why.to_string()))?;
+        Native::new(py, machine, self.instance.block(), &self.program.description)
+    }
+
     /// A second instance that continues from the same state.
     fn copy(&self) -> Stepper {
         Stepper {
@@ -403,19 +527,14 @@ impl Stepper {
 
     /// What `fric._restore.stepper` needs to make the same instance elsewhere.
     fn __reduce__<'py>(&self, py: Python<'py>) -> PyResult<(Bound<'py, PyAny>, Bound<'py, PyTuple>)> {
-        let Plan { text, model, method, step, interpret, .. } = &*self.plan;
-        let (name, source) = text.get().source_text();
-        let files = text.get().named_files();
         let block: Vec<u8> = self.instance.block().iter().flat_map(|x| x.to_le_bytes()).collect();
-        let text = (name, source, files).into_pyobject(py)?;
-        let names = |all: &[(String, Slot)]| all.iter().map(|(name, _)| name.clone()).collect::<Vec<String>>();
         let rest = (
-            text,
-            model,
+            self.plan.source(py)?,
+            &self.plan.model,
             &self.set,
-            (method.name(), *step, *interpret),
-            names(&self.plan.inputs),
-            names(&self.plan.outputs),
+            self.plan.how(),
+            names_of(&self.plan.inputs),
+            names_of(&self.plan.outputs),
             PyBytes::new(py, &block),
         );
         Ok((raise::function(py, "stepper")?, rest.into_pyobject(py)?))
@@ -423,8 +542,7 @@ impl Stepper {
 
     /// Continues from the block of another instance of the same model.
     fn restore(&mut self, block: &[u8]) -> PyResult<()> {
-        let numbers: Vec<f64> =
-            block.chunks_exact(8).map(|bytes| f64::from_le_bytes(bytes.try_into().expect("eight bytes"))).collect();
+        let numbers = doubles_of(block);
         if numbers.len() != self.instance.block().len() {
             return Err(PyValueError::new_err(
                 "this instance was stored by another version of fric, whose models have another layout",
@@ -467,7 +585,7 @@ impl Stepper {
     fn change(&mut self, py: Python, changed: BTreeMap<String, String>) -> PyResult<()> {
         let mut set = self.set.clone();
         set.extend(changed);
-        let Started { program, mut instance, .. } = Started::again(py, &self.plan, &set)?;
+        let Started { program, mut instance, .. } = Started::like(py, &self.plan, &set, &self.program, &self.instance)?;
         if !same_slots(&program, &self.program) {
             return Err(raise::range(
                 py,
@@ -482,38 +600,50 @@ impl Stepper {
         }
         let status = instance.call(Function::Outputs);
         checked(py, &instance, status, None)?;
-        (self.set, self.program, self.instance, self.follow) = (set, program, instance, None);
+        if !is_same_code(&program, &self.program) {
+            self.follow = None;
+        }
+        (self.set, self.program, self.instance) = (set, program, instance);
         Ok(())
     }
 
     /// Writes the inputs.
-    fn give(&mut self, inputs: &Bound<PyTuple>) -> PyResult<()> {
+    fn give(&mut self, first: [Given; 4], rest: &Bound<PyTuple>) -> PyResult<()> {
         let needed = self.plan.inputs.len();
-        if inputs.len() != needed {
+        let few = first.iter().take_while(|given| given.0.is_some()).count();
+        // There are further ones only after these.
+        let given = if few < first.len() { few } else { few + rest.len() };
+        if given != needed {
             let names: Vec<&str> = self.inputs();
             return Err(PyTypeError::new_err(format!(
-                "{needed} inputs are needed, ({}), and {} were given",
-                names.join(", "),
-                inputs.len()
+                "{needed} inputs are needed, ({}), and {given} were given",
+                names.join(", ")
             )));
         }
         // All are read before one is written, so that a wrong one changes nothing.
-        let mut few = [0.0; 8];
-        let mut many;
-        let numbers = if needed <= few.len() {
-            &mut few[..needed]
-        } else {
-            many = vec![0.0; needed];
-            &mut many[..]
-        };
-        for (k, (number, input)) in numbers.iter_mut().zip(inputs.iter_borrowed()).enumerate() {
-            *number = input.extract().map_err(|_| {
-                let kind = input.get_type().name().map_or_else(|_| "?".into(), |name| name.to_string());
-                PyTypeError::new_err(format!("`{}` is a number in SI, not {kind}", self.plan.inputs[k].0))
-            })?;
+        let mut numbers = [0.0; 4];
+        for (k, given) in first.iter().enumerate().take(few) {
+            if let Some(given) = given.0 {
+                numbers[k] = self.number(k, given)?;
+            }
         }
-        self.plan.inputs.iter().zip(numbers).for_each(|((_, slot), number)| self.instance.set(*slot, *number));
+        if given > few {
+            let more = rest.iter_borrowed().enumerate().map(|(k, given)| self.number(few + k, given));
+            let more = more.collect::<PyResult<Vec<f64>>>()?;
+            let slots = self.plan.inputs[few..].iter().zip(more);
+            slots.for_each(|((_, slot), number)| self.instance.set(*slot, number));
+        }
+        self.plan.inputs.iter().zip(numbers).for_each(|((_, slot), number)| self.instance.set(*slot, number));
         Ok(())
+    }
+
+    /// An input as a number.
+    #[inline]
+    fn number(&self, k: usize, given: Borrowed<PyAny>) -> PyResult<f64> {
+        given.extract().map_err(|_: PyErr| {
+            let kind = given.get_type().name().map_or_else(|_| "?".into(), |name| name.to_string());
+            PyTypeError::new_err(format!("`{}` is a number in SI, not {kind}", self.plan.inputs[k].0))
+        })
     }
 
     /// The outputs: a float, or a tuple of several.

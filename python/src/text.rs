@@ -101,6 +101,56 @@ impl Text {
         Ok(runs.into_iter().map(|run| Run { run }).collect())
     }
 
+    /// What `fric explain` says of a model: in words, and as JSON.
+    fn explain(&self, py: Python, model: &str, set: Vec<String>) -> PyResult<(String, String)> {
+        let changes = Changes { set, ..Changes::default() };
+        let found = guarded(py, || py.detach(|| self.text.explain(model, &changes)))?;
+        found.map_err(|found| raise::problems(py, &found))
+    }
+
+    /// The JSON of `fric linearise`.
+    #[allow(clippy::too_many_arguments, reason = "the Python files name each of them")]
+    fn linearise(
+        &self,
+        py: Python,
+        name: &str,
+        set: Vec<String>,
+        inputs: Vec<String>,
+        outputs: Vec<String>,
+        params: Vec<String>,
+        at: Vec<(String, String)>,
+        time: Option<f64>,
+        rest: bool,
+    ) -> PyResult<String> {
+        let changes = Changes { set, ..Changes::default() };
+        let ports = embed::Ports { inputs, outputs, params, broken: None };
+        let found = guarded(py, || py.detach(|| self.text.linearise(name, changes, ports, &at, time, rest)))?;
+        found.map_err(|found| raise::problems(py, &found))
+    }
+
+    /// Where a quantity comes to rest while inputs are held: see `embed::Text::steady`.
+    fn steady<'py>(
+        &self,
+        py: Python<'py>,
+        model: &str,
+        set: Vec<String>,
+        quantity: &str,
+        inputs: Vec<(String, Vec<f64>)>,
+    ) -> PyResult<Bound<'py, PyAny>> {
+        let changes = Changes { set, ..Changes::default() };
+        let work = |progress: &crate::watched::Progress| {
+            self.text.steady(model, &changes, quantity, &inputs, &|fraction| progress.report(fraction))
+        };
+        let found = watched(py, None, work)?.map_err(|found| raise::problems(py, &found))?;
+        arrays::array(py, found, None)
+    }
+
+    /// Runs a friction model through the standard battery: the JSON of `fric characterise`, and the page.
+    fn characterise(&self, py: Python, model: &str, set: Vec<(String, String)>) -> PyResult<(String, String)> {
+        let found = watched(py, None, |_| self.text.characterise(model, &set))?;
+        found.map_err(PyValueError::new_err)
+    }
+
     /// All named quantities of a model on its own.
     fn describe(&self, py: Python, model: &str, set: Vec<String>) -> PyResult<Vec<Described>> {
         let built = self.built(py, model, Changes { set, ..Changes::default() })?;
@@ -230,6 +280,15 @@ impl Run {
     fn every(&self) -> Option<f64> {
         self.run.every()
     }
+}
+
+/// A capsule with columns of doubles for readers of the Arrow C stream interface. `columns`: names and arrays.
+#[pyfunction]
+pub fn arrow_stream<'py>(
+    py: Python<'py>,
+    columns: Vec<(String, Bound<'py, PyAny>)>,
+) -> PyResult<Bound<'py, pyo3::types::PyCapsule>> {
+    crate::arrow::stream(py, columns)
 }
 
 /// A recording as read-only arrays, a column each.

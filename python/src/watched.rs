@@ -6,7 +6,7 @@ use runtime::engine::Continue;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::mpsc::{RecvTimeoutError, channel};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 /// Pause between two looks for signals.
 const LOOK: Duration = Duration::from_millis(20);
@@ -77,6 +77,32 @@ pub fn watched<T: Send>(
         (None, Some(Ok(done))) => Ok(done),
         (None, Some(Err(message))) => Err(raise::internal(py, &message)),
         (None, None) => Err(raise::internal(py, "a thread ended without a result")),
+    }
+}
+
+/// Steps in one call from which on other threads may run meanwhile: some 10 µs.
+const LONG: u64 = 1000;
+
+/// Makes `count` steps in parts between which other threads run and Ctrl-C is noticed. `part(done, some)` makes `some` steps
+/// after the first `done`, and returns the number made and the status; fewer, or a status that is not 0, end the work. Returns
+/// the number of steps and the last status.
+pub fn in_parts(py: Python, count: u64, mut part: impl FnMut(u64, u64) -> (u64, u64) + Send) -> PyResult<(u64, u64)> {
+    if count < LONG {
+        return Ok(part(0, count));
+    }
+    let (mut done, mut some) = (0, LONG);
+    loop {
+        let begin = Instant::now();
+        some = some.min(count - done);
+        let (made, status) = py.detach(|| part(done, some));
+        done += made;
+        if status != 0 || made < some || done == count {
+            return Ok((done, status));
+        }
+        py.check_signals()?;
+        if begin.elapsed() < LOOK / 8 {
+            some *= 4;
+        }
     }
 }
 

@@ -4,7 +4,7 @@ use super::{End, load, sound};
 use crate::args::{Characterise, Compare, Figures};
 use crate::characterise::subject::{self, Origin, Subject, Written};
 use crate::characterise::{Extent, Seen, Study, family as study_of_family, latex, page, shown, study};
-use crate::compile::{self, Changes, Loaded, Options, Stopwatch};
+use crate::compile::{self, Changes, Loaded, Options, Sources, Stopwatch};
 use crate::terminal::{Style, Terminal};
 use crate::vary::{How, Vary};
 use crate::{project, report};
@@ -180,7 +180,7 @@ fn failed(terminal: &Terminal, why: &str) -> End {
     End::Failed
 }
 
-fn battery_in(folder: &Path) -> String {
+pub(crate) fn battery_in(folder: &Path) -> String {
     folder.join("battery.fric").display().to_string()
 }
 
@@ -233,13 +233,18 @@ fn subjects(
             written.set(path, value)?;
         }
         let folder = folder(written.model(), many);
-        found.push((fitted(written, is_file.then_some(path), &folder)?, folder));
+        found.push((fitted(written, is_file.then_some(path), &folder, &crate::disk::Disk)?, folder));
     }
     Ok(found)
 }
 
 /// Finds a model, compiles it alone, and reads its ports.
-pub(super) fn fitted(written: Written, file: Option<&Path>, folder: &Path) -> Result<Subject, String> {
+pub(crate) fn fitted(
+    written: Written,
+    file: Option<&Path>,
+    folder: &Path,
+    sources: &dyn Sources,
+) -> Result<Subject, String> {
     let (origin, own) = match file {
         None => (Origin::Library, String::new()),
         Some(path) => {
@@ -253,12 +258,12 @@ pub(super) fn fitted(written: Written, file: Option<&Path>, folder: &Path) -> Re
     let imports = match file {
         None => imports[1].clone(),
         Some(_) => {
-            let alone = compile::load(&name, &probe(&imports[0], &written, &[]), &crate::disk::Disk);
-            let unknown = compiled(&alone, "probe").is_err_and(|found| found.contains("E0201"));
+            let alone = compile::load(&name, &probe(&imports[0], &written, &[]), sources);
+            let unknown = compiled(&alone, "probe", sources).is_err_and(|found| found.contains("E0201"));
             imports[usize::from(unknown)].clone()
         }
     };
-    let loaded = compile::load(&name, &imports, &crate::disk::Disk);
+    let loaded = compile::load(&name, &imports, sources);
     if loaded.has_errors() {
         return Err(report::full(&loaded.files.0, &loaded.diagnostics, false));
     }
@@ -277,8 +282,8 @@ pub(super) fn fitted(written: Written, file: Option<&Path>, folder: &Path) -> Re
     let open: Vec<&str> =
         subject::open_inputs(model).into_iter().filter(|name| matches!(*name, "v" | "F_ext")).collect();
     let zero: Vec<(&str, &str)> = open.iter().map(|name| (*name, "0")).collect();
-    let loaded = compile::load(&name, &probe(&imports, &written, &zero), &crate::disk::Disk);
-    let cases = compiled(&loaded, "probe")?;
+    let loaded = compile::load(&name, &probe(&imports, &written, &zero), sources);
+    let cases = compiled(&loaded, "probe", sources)?;
     let instance = &cases[0].instance;
     let description = instance.description();
     let (_, model) = subject::model(&loaded, written.model()).expect("it was there before");
@@ -314,13 +319,13 @@ fn probe(imports: &str, written: &Written, zero: &[(&str, &str)]) -> String {
     format!("{imports}\nexperiment probe {{ run {} for 1 s }}\n", written.with(zero))
 }
 
-fn compiled(loaded: &Loaded, name: &str) -> Result<Vec<compile::Case>, String> {
+fn compiled(loaded: &Loaded, name: &str, sources: &dyn Sources) -> Result<Vec<compile::Case>, String> {
     let mut loaded = loaded.clone();
     if loaded.has_errors() {
         return Err(report::full(&loaded.files.0, &loaded.diagnostics, false));
     }
     let options = Options { changes: Changes::default(), interpret: true };
-    compile::compile(&mut loaded, &crate::disk::Disk, name, &options, &mut Vec::new(), &mut |_| ())
+    compile::compile(&mut loaded, sources, name, &options, &mut Vec::new(), &mut |_| ())
         .map_err(|found| report::full(&loaded.files.0, &found, false))
 }
 
@@ -411,7 +416,7 @@ fn table(studies: &[Study], terminal: &Terminal) -> String {
 }
 
 /// The output of `--json`.
-fn json(study: &Study) -> Value {
+pub(crate) fn json(study: &Study) -> Value {
     let number = |value: f64| serde_json::Number::from_f64(value).map_or(Value::Null, Value::Number);
     let tests = study.tests.iter().map(|test| {
         let numbers: Vec<Value> = test
@@ -454,7 +459,7 @@ mod tests {
 
     fn studied(model: &str, extent: Extent) -> Study {
         let folder = Path::new("out");
-        let subject = fitted(Written::read(model).unwrap(), None, folder).unwrap();
+        let subject = fitted(Written::read(model).unwrap(), None, folder, &crate::disk::Disk).unwrap();
         study(subject, &battery_in(folder), &crate::disk::Disk, extent).unwrap()
     }
 

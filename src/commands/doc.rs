@@ -50,7 +50,7 @@ fn plots(folder: &Path, terminal: &mut Terminal) -> Result<(), String> {
             let name = &model.name.text;
             let battery = folder.join("battery.fric").display().to_string();
             let studied = Written::read(name)
-                .and_then(|written| fitted(written, None, folder))
+                .and_then(|written| fitted(written, None, folder, &crate::disk::Disk))
                 .and_then(|subject| study(subject, &battery, &crate::disk::Disk, Extent::Sketch));
             let studied = match studied {
                 Ok(studied) => studied,

@@ -119,8 +119,8 @@ fn models(args: &Explain, terminal: &mut Terminal) -> End {
     end
 }
 
-/// Prints everything about a model, with the time of its steps if requested.
-pub(super) fn tell(explanation: &Explanation, bounds: &[Bound], terminal: &mut Terminal) {
+/// Prints everything about a model, with the measured times of its steps if there are any.
+pub(crate) fn tell(explanation: &Explanation, bounds: &[Bound], terminal: &mut Terminal) {
     terminal.line(&terminal.styled(Style::Bold, &explanation.model));
     let width = |of: &mut dyn Iterator<Item = usize>| of.max().unwrap_or(0);
     let names = width(&mut explanation.quantities.iter().map(|q| q.path.chars().count()));
@@ -196,7 +196,8 @@ fn stable_steps(explanation: &Explanation) -> Option<String> {
     all.map(|all| all.join(", "))
 }
 
-fn as_json(explanation: &Explanation, bounds: &[Bound]) -> serde_json::Value {
+/// The same as JSON.
+pub(crate) fn as_json(explanation: &Explanation, bounds: &[Bound]) -> serde_json::Value {
     json!({
         "model": explanation.model,
         "quantities": explanation.quantities.iter().map(|q| json!({
@@ -231,7 +232,7 @@ const MARGIN: f64 = 2.0;
 const STEP: f64 = 1e-3;
 
 /// The measured time of one call, in ns.
-pub(super) struct Bound {
+pub(crate) struct Bound {
     method: Method,
     median: f64,
     /// An upper bound for all calls but a hundred.

@@ -48,7 +48,8 @@ pub fn linearise(args: &Linearise, terminal: &mut Terminal) -> End {
         terminal.error(&format!("there is no parameter `{unknown}`{help}"));
         return End::Failed;
     }
-    if let Err(message) = go_to_point(&mut linear, args) {
+    let point = Point { at: &args.at, time: args.time, rest: args.rest };
+    if let Err(message) = go_to_point(&mut linear, &point) {
         terminal.error(&message);
         return End::Failed;
     }
@@ -61,16 +62,12 @@ pub fn linearise(args: &Linearise, terminal: &mut Terminal) -> End {
             }
         };
     }
-    let found = linear.at();
-    let all = [&found.a, &found.b, &found.c, &found.d, &found.p, &found.q];
-    if !all.iter().all(|matrix| matrix.iter().all(|entry| entry.is_finite())) {
-        terminal.error("the derivatives are not finite at this point; give another one with --at");
-        return End::Failed;
-    }
-    let modes = modes(linear.states.len(), &found.a);
-    let Some(modes) = modes else {
-        terminal.error("the eigenvalues of A could not be found");
-        return End::Failed;
+    let (found, modes) = match matrices_and_modes(&mut linear) {
+        Ok(found) => found,
+        Err(message) => {
+            terminal.error(&message);
+            return End::Failed;
+        }
     };
     if let Some(path) = &args.out {
         let bytes = match path.extension().and_then(|extension| extension.to_str()) {
@@ -95,11 +92,42 @@ pub fn linearise(args: &Linearise, terminal: &mut Terminal) -> End {
     End::Fine
 }
 
+/// The matrices at the point where the instance is, and the modes of A.
+fn matrices_and_modes(linear: &mut Linear) -> Result<(Matrices, Vec<Mode>), String> {
+    let found = linear.at();
+    let all = [&found.a, &found.b, &found.c, &found.d, &found.p, &found.q];
+    if !all.iter().all(|matrix| matrix.iter().all(|entry| entry.is_finite())) {
+        return Err("the derivatives are not finite at this point; give another one with --at".into());
+    }
+    let modes = modes(linear.states.len(), &found.a).ok_or("the eigenvalues of A could not be found")?;
+    Ok((found, modes))
+}
+
+/// The JSON of `fric linearise` at a point.
+///
+/// # Errors
+/// Why there is no such point, or there are no matrices, in words.
+pub(crate) fn as_json(linear: &mut Linear, point: &Point) -> Result<Value, String> {
+    go_to_point(linear, point)?;
+    let (found, modes) = matrices_and_modes(linear)?;
+    Ok(object(linear, &found, &modes))
+}
+
+/// An operating point.
+pub(crate) struct Point<'a> {
+    /// Values of states, free inputs, parameters and regimes, as texts.
+    pub at: &'a [(String, String)],
+    /// Time in s.
+    pub time: Option<f64>,
+    /// Where everything has come to rest.
+    pub rest: bool,
+}
+
 /// Moves the instance to the operating point: the state of an experiment at a given time, if requested; then the given
 /// values.
-fn go_to_point(linear: &mut Linear, args: &Linearise) -> Result<(), String> {
+fn go_to_point(linear: &mut Linear, args: &Point) -> Result<(), String> {
     let mut later = Vec::new();
-    for (path, text) in &args.at {
+    for (path, text) in args.at {
         if let Some((slot, number)) = regime(linear, path, text) {
             later.push((slot, number?));
             continue;

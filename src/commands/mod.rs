@@ -7,7 +7,7 @@ mod shared;
 mod build;
 #[cfg(all(feature = "hardware", target_os = "linux"))]
 mod bus;
-mod characterise;
+pub(crate) mod characterise;
 mod check;
 mod deploy;
 mod doc;
@@ -15,7 +15,7 @@ mod doc;
 mod doctor;
 #[cfg(all(feature = "hardware", target_os = "linux"))]
 mod drives;
-mod explain;
+pub(crate) mod explain;
 mod fmt;
 #[cfg(all(feature = "hardware", target_os = "linux"))]
 mod beside;
@@ -27,7 +27,7 @@ mod company;
 mod hil;
 mod inspect;
 mod key;
-mod linearise;
+pub(crate) mod linearise;
 mod new;
 mod remote_rig;
 mod panel;
