@@ -1,12 +1,12 @@
-"""The notebooks of examples/python run from beginning to end."""
+"""The notebooks and programs of examples/python run from beginning to end."""
+
+import runpy
 
 import pytest
 
-nbformat = pytest.importorskip("nbformat")
-nbclient = pytest.importorskip("nbclient")
-
 
 def test_notebooks_run(root):
+    nbformat, nbclient = pytest.importorskip("nbformat"), pytest.importorskip("nbclient")
     notebooks = sorted((root / "examples/python").glob("*.ipynb"))
     assert notebooks
     for path in notebooks:
@@ -18,3 +18,14 @@ def test_notebooks_run(root):
         client.execute()
         shown = "".join(str(cell.get("outputs", "")) for cell in notebook.cells)
         assert "<svg" in shown and "<script" not in shown
+
+
+def test_a_joint_of_mujoco_loses_the_work_of_friction(root):
+    pytest.importorskip("mujoco")
+    example = runpy.run_path(str(root / "examples/python/mujoco_joint.py"))
+    drifts = []
+    for step in (4e-4, 2e-4):
+        found = example["swing"](step, duration=3.0)
+        drifts.append(abs(found["lost"] / found["work"] - 1))
+        assert found["lost"] > 1.0
+    assert drifts[0] < 1e-3 and 1.6 < drifts[0] / drifts[1] < 2.5, "the drift is of first order in the step"
