@@ -10,7 +10,7 @@ use crate::commands::{End, reported};
 use crate::compile::{ElementaryFunction, Loaded};
 use crate::quantity::{count, show, significant};
 use crate::terminal::Terminal;
-use runtime::fit::ranking::{self, Contender};
+use runtime::fit::ranking::{self, Contender, Paired};
 use runtime::fit::{Residuals, Trouble};
 use std::path::Path;
 
@@ -108,8 +108,15 @@ fn table(title: &str, tried: &[Tried], ranks: &[(usize, usize)]) -> String {
         Some(after::misfit(&one.runs, answer, &answer.values) + parameters * log.at(rows as f64))
     };
     let least = tried.iter().filter_map(&criterion).fold(f64::INFINITY, f64::min);
-    let mut table = vec![["", "law", "parameters", "rms", "held out", "ΔBIC"].map(str::to_string)];
-    for (k, rank) in ranks {
+    let mut table = vec![["", "law", "parameters", "rms", "held out", "ΔBIC", "than the next"].map(str::to_string)];
+    let contenders = contenders(tried);
+    let against = |k: usize, next: Option<&(usize, usize)>| {
+        let Paired { better: (better, all), gain: (gain, error) } =
+            ranking::paired(&contenders[k], &contenders[next?.0], steady)?;
+        let [gain, error] = [gain, error].map(|part| significant(100.0 * part, 2));
+        Some(format!("better in {better} of {all}, by {gain} ± {error} %"))
+    };
+    for (at, (k, rank)) in ranks.iter().enumerate() {
         let one = &tried[*k];
         let items = || one.runs.parts.iter().flat_map(|part| &part.asks.items);
         let each = |residuals: &[Vec<f64>]| -> String {
@@ -122,10 +129,11 @@ fn table(title: &str, tried: &[Tried], ranks: &[(usize, usize)]) -> String {
         };
         let held_out = one.held_out.as_deref().map_or(String::new(), each);
         let bic = criterion(one).map_or(String::new(), |bic| significant(bic - least, 4));
-        table.push([rank.to_string(), one.law.clone(), one.runs.unknowns.len().to_string(), seen, held_out, bic]);
+        let next = against(*k, ranks.get(at + 1)).unwrap_or_default();
+        table.push([rank.to_string(), one.law.clone(), one.runs.unknowns.len().to_string(), seen, held_out, bic, next]);
     }
     let width = |column: usize| table.iter().map(|row| row[column].chars().count()).max().unwrap_or(0);
-    let widths = [0, 1, 2, 3, 4, 5].map(width);
+    let widths = [0, 1, 2, 3, 4, 5, 6].map(width);
     for row in &table {
         let cells: Vec<String> = row.iter().zip(widths).map(|(cell, width)| format!("{cell:width$}")).collect();
         out += &format!("  {}\n", cells.join("  ").trim_end());
