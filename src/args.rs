@@ -70,6 +70,8 @@ pub enum Command {
     Sweep(Sweep),
     /// Find the parameters with which a model follows a recording, with intervals
     Fit(Fit),
+    /// Design the motion that makes the unknowns of a fit most certain, within limits
+    Excite(Excite),
     /// A, B, C, D and the modes of a model or an experiment at a point
     Linearise(Linearise),
     /// Time the step of an experiment: alone, in lanes, on all cores
@@ -131,7 +133,7 @@ pub enum Command {
     Man {
         /// Such as run
         #[arg(value_parser = [
-            "run", "test", "sweep", "fit", "linearise", "bench", "build", "hil", "replay", "check", "fmt", "explain",
+            "run", "test", "sweep", "fit", "excite", "linearise", "bench", "build", "hil", "replay", "check", "fmt", "explain",
             "characterise", "compare", "doc", "repl", "watch", "panel", "inspect", "key", "deploy", "fetch-log", "drives",
             "bus", "doctor", "predict", "bench-rt", "new", "completions",
         ])]
@@ -567,6 +569,53 @@ pub struct Fit {
     /// Interpret instead of making machine code: slow, for comparison
     #[arg(long)]
     pub interpret: bool,
+}
+
+/// `fric excite`
+#[derive(clap::Args, Debug)]
+pub struct Excite {
+    /// The text
+    #[arg(value_hint = ValueHint::FilePath)]
+    pub file: PathBuf,
+    /// The fit whose unknowns are to be determined; its recording need not exist [default: the only one]
+    #[arg(value_name = "FIT")]
+    pub fit: Option<String>,
+    /// How long the motion is, after one period in which it is faded in
+    #[arg(long = "for", value_name = "TIME", value_parser = positive_time)]
+    pub duration: f64,
+    /// Limits of what moves, such as 'x = -2 mm .. 2 mm' and 'v = -50 mm/s .. 50 mm/s'; at least one
+    #[arg(long = "limit", value_name = "NAME = LOW .. HIGH", required = true)]
+    pub limits: Vec<String>,
+    /// Number of harmonics of the lowest frequency
+    #[arg(long, value_name = "N", default_value_t = 5, value_parser = harmonics)]
+    pub harmonics: usize,
+    /// The lowest frequency
+    #[arg(long, value_name = "FREQUENCY", default_value = "1Hz", value_parser = any_frequency)]
+    pub base: f64,
+    /// Rows in each second of the recording
+    #[arg(long, value_name = "FREQUENCY", default_value = "1kHz", value_parser = frequency)]
+    pub rate: f64,
+    /// Values of a fit so far, out/NAME.json: the next best experiment [default: 8 sets of values all over the ranges]
+    #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
+    pub known: Option<PathBuf>,
+    /// Motions that are judged
+    #[arg(long, value_name = "N", default_value_t = 600)]
+    pub evaluations: usize,
+    /// Seed of the motions and of the sets of values
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    pub seed: u64,
+    /// Threads; the answer does not depend on their number [default: one for each processor]
+    #[arg(long, value_name = "N", value_parser = threads)]
+    pub threads: Option<usize>,
+    /// The text that is written, with a model `Excite`; beside it a table of the same name, .csv
+    #[arg(long, short, value_name = "FILE", default_value = "excite.fric", value_hint = ValueHint::FilePath)]
+    pub output: PathBuf,
+    /// One JSON object in place of words
+    #[arg(long)]
+    pub json: bool,
+    /// Print nothing but errors
+    #[arg(long, short)]
+    pub quiet: bool,
 }
 
 /// `fric linearise`
@@ -1285,6 +1334,22 @@ fn frequency(text: &str) -> Result<f64, String> {
         return Err("a frequency is needed, for example 1kHz".into());
     }
     if (1.0..=20e3).contains(&value) { Ok(value) } else { Err("a frequency from 1 Hz to 20 kHz is needed".into()) }
+}
+
+fn any_frequency(text: &str) -> Result<f64, String> {
+    let (value, unit) = quantity::parse(text)?;
+    let hertz = Unit::parse("Hz").expect("the hertz is known").dimension;
+    if unit.dimension == hertz && value > 0.0 && value.is_finite() {
+        return Ok(value);
+    }
+    Err("a frequency is needed, for example 0.5Hz".into())
+}
+
+fn harmonics(text: &str) -> Result<usize, String> {
+    match text.parse() {
+        Ok(harmonics) if (1..=50).contains(&harmonics) => Ok(harmonics),
+        _ => Err("a number from 1 to 50 is needed".into()),
+    }
 }
 
 fn tolerance(text: &str) -> Result<f64, String> {

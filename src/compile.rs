@@ -28,6 +28,7 @@ pub use compiler::frontend::columns::{Columns, Selector, read as read_columns};
 pub use compiler::frontend::names::nearest;
 pub use compiler::frontend::resolve::{Lookup, Space};
 pub use compiler::frontend::system::LINTS;
+pub use compiler::functions::Unary;
 use compiler::opt::reassociate;
 #[cfg(all(feature = "hardware", target_os = "linux"))]
 pub use compiler::rig::dbc_messages;

@@ -3,7 +3,7 @@
 //! The result of the search is shown as a table, as an
 //! instance to paste, and written as JSON, CSV and a picture.
 
-mod search;
+pub mod search;
 mod after;
 mod answer;
 mod page;
@@ -95,6 +95,19 @@ fn chosen(file: &Path, named: &[String], loaded: &Loaded) -> Result<Vec<String>,
         }
     }
     Ok(if named.is_empty() { all.into_iter().map(str::to_string).collect() } else { named.to_vec() })
+}
+
+/// The fit that is named, or the only one.
+///
+/// # Errors
+/// The fits that exist instead, in words.
+pub fn only(file: &Path, named: Option<&str>, loaded: &Loaded) -> Result<String, String> {
+    let names: Vec<String> = named.into_iter().map(str::to_string).collect();
+    let mut all = chosen(file, &names, loaded)?;
+    match all.len() {
+        1 => Ok(all.remove(0)),
+        _ => Err(format!("{} has several fits: name one of {}", file.display(), all.join(", "))),
+    }
 }
 
 fn one(args: &args::Fit, loaded: &mut Loaded, name: &str, options: &Options, terminal: &mut Terminal) -> End {

@@ -38,6 +38,7 @@ mod replay;
 mod run;
 pub mod sweep;
 mod fit;
+mod excite;
 mod test;
 
 use crate::args::{self, Args, Command, Key, Repl};
@@ -92,6 +93,7 @@ pub fn run(args: &Args, begin: Instant, terminal: &mut Terminal) -> End {
         }
         Command::Sweep(sweep) => sweep::sweep(sweep, terminal),
         Command::Fit(args) => fit::fit(args, terminal),
+        Command::Excite(args) => excite::excite(args, terminal),
         Command::Linearise(linearise) => linearise::linearise(linearise, terminal),
         Command::Bench(args) => bench::bench(args, terminal),
         Command::Build(build) => build::build(build, terminal),

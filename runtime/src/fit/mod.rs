@@ -12,6 +12,8 @@ pub mod noise;
 pub mod estimate;
 pub mod statistics;
 pub mod ranking;
+pub mod information;
+pub mod cma_es;
 
 pub use estimate::{Answer, Combination, Item, Minima, Question, Residuals, Trouble, Way, fit};
 pub use noise::Noise;

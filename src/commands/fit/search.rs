@@ -297,7 +297,7 @@ impl Runs {
     }
 
     /// The search's view of what is asked, from these starts.
-    pub(super) fn asked(&self, starts: &[f64]) -> (Vec<Unknown>, Vec<Item>) {
+    pub fn asked(&self, starts: &[f64]) -> (Vec<Unknown>, Vec<Item>) {
         let unknown = |(one, start): (&compile::FitUnknown, &f64)| Unknown {
             low: one.range.0,
             high: one.range.1,
