@@ -220,10 +220,13 @@ def test_memory_does_not_grow():
     gc.collect()
     tracemalloc.start()
     calls(2000)
-    first = tracemalloc.get_traced_memory()[0]
-    calls(20_000)
-    gc.collect()
-    grown = tracemalloc.get_traced_memory()[0] - first
+    # A leak is in each of three parts; what other tests have left to be cached is in one.
+    seen = []
+    for _ in range(4):
+        seen.append(tracemalloc.get_traced_memory()[0])
+        calls(7_000)
+        gc.collect()
+    grown = 3 * min(after - before for before, after in zip(seen, seen[1:]))
     tracemalloc.stop()
     assert grown < 20_000, f"{grown} bytes in 20,000 calls"
 
