@@ -4,8 +4,8 @@ import { decode, connect, embedded, joined } from './link.js';
 import { Plot, COLOURS, DASHES, sample, valueAt, bars } from './plot.js';
 import { Knobs } from './knobs.js';
 
-/** Seconds that are shown of what still grows. */
-const LAST = 20;
+/** Seconds that are shown of what still grows, and at most in the plane. */
+const LAST = 20, PHASE = 10;
 /** How far the picture is behind the newest data, s: these come ten times a second, and the picture moves evenly. */
 const BEHIND = 0.25;
 /** Least time between two pictures of what moves, ms: the browser then takes the next of its own. */
@@ -51,9 +51,11 @@ let questions = 0;
 /** Whether the model beside a rig runs on from arming, and not anew from each full state. */
 let free = false;
 /** Whether a layer of a rig is drawn. @param {number} layer */
-const drawn = layer => hello.kind === 'what if' || layer === 0 || layer === (free || !state.layers[2] ? 1 : 2);
+const drawn = layer => hello.kind === 'what if' || layer === 0 || layer === 3 || layer === (free || !state.layers[2] ? 1 : 2);
 /** What to do with refusals, by the number of the line. @type {Map<number, (why: string) => void>} */
 const refusals = new Map();
+/** The same by the number under which a rig answers. @type {Map<number, (why: string) => void>} */
+const ofRig = new Map();
 
 const saved = document.getElementById('data');
 const link = saved ? embedded(JSON.parse(saved.textContent ?? '{}'), message) : connect(buffer => { frames.push(buffer); wake(); }, message, lost);
@@ -81,7 +83,11 @@ function message(what) {
     const refuse = refusals.get(what.number);
     refusals.delete(what.number);
     if (what.refused) (refuse ?? (why => problem(why)))(what.refused);
-    else if (hello?.kind === 'rig') problem(null);
+    else if (hello?.kind === 'rig') {
+      problem(null);
+      if (refuse && refuse !== problem && what.ok) ofRig.set(Number(what.ok), refuse);
+      if (ofRig.size > 100) ofRig.delete(ofRig.keys().next().value ?? 0);
+    }
   }
 }
 
@@ -174,19 +180,56 @@ function chair() {
   place.replaceChildren(text, ...acts.map(act => button(words[/** @type {'take' | 'refuse' | 'give'} */ (act)], () => say(act, problem))));
 }
 
-/** Values of the parameters of a rig that were kept under a letter. @type {Map<string, string[]>} */
+/** What was kept of a rig under a letter: the values of its parameters, the window, and its curves by what they stand over. @type {Map<string, { texts: string[], span: [number, number], curves: { signal: number, against: number | null, x: Float64Array, y: Float64Array }[], shown: boolean }>} */
 const keptOf = new Map();
 
+/** Keeps the values in effect and the curves that are shown. @param {string} letter */
+function keepAs(letter) {
+  const [from, to] = span(), curves = plots.flatMap(one => [...one.curves].filter(([number]) => parts(number).layer === 0).map(([number, { x, y }]) => {
+    const { signals, against } = one.canvas, signal = parts(number).signal;
+    if (!signals.includes(signal)) return null;
+    // As they are now: a later frame adds to them.
+    const inside = (/** @type {number} */ i) => against !== null || x[i] >= from && x[i] <= to;
+    const all = [...x.keys()].filter(inside);
+    return { signal, against, x: Float64Array.from(all, i => x[i]), y: Float64Array.from(all, i => y[i]) };
+  }).filter(curve => curve !== null));
+  keptOf.set(letter, { texts: [...state.texts], span: [from, to], curves, shown: true });
+  keeps(true);
+  legend();
+  wake();
+}
+
+/** The curves that were kept, over what is shown: they stand still, with the right edge of their window at that of this one. @param {any} one @param {string} letter @param {any} kept */
+function ghosts(one, letter, kept) {
+  const { signals, against } = one.canvas, by = span()[1] - kept.span[1];
+  return kept.curves.filter((/** @type {any} */ curve) => signals.includes(curve.signal) && curve.against === against).map((/** @type {any} */ curve) => ({
+    ...curve, ...look(one.canvas, curve.signal), dash: KEPT_DASHES[letter], ghost: true, still: true, curve: -1, step: hello.signals[curve.signal].boolean, layer: 0, by: against === null ? by : 0,
+  }));
+}
+/** @type {Record<string, number[]>} */
+const KEPT_DASHES = { A: [9, 4], B: [3, 3] };
+
 /** Two sets of values of a rig, to go back and forth: they are prepared, and sent by Apply. */
-function keeps() {
+function keeps(anew = false) {
   const text = state.set || words.none, place = element('kept');
   if (input('set').value !== text) input('set').value = text;
   /** @type {HTMLButtonElement} */ (element('copied')).disabled = !state.set;
-  if (place.childElementCount === 2 + keptOf.size) return;
-  place.replaceChildren(...['A', 'B'].flatMap(letter => [
-    button(words.keep(letter), () => { keptOf.set(letter, [...state.texts]); keeps(); }),
-    ...keptOf.has(letter) ? [button(words.goStaged(letter), () => knobs?.prepare(keptOf.get(letter) ?? [], state.texts))] : [],
-  ]));
+  if (place.childElementCount > 0 && !anew) return;
+  const focus = document.activeElement?.textContent;
+  place.replaceChildren(...['A', 'B'].flatMap(letter => {
+    const kept = keptOf.get(letter);
+    return [button(words.keep(letter), () => keepAs(letter)), ...kept ? [
+      button(words.goStaged(letter), () => knobs?.prepare(kept.texts, state.texts)),
+      button(words.ghost(letter), () => {
+        kept.shown = !kept.shown;
+        keeps(true);
+        legend();
+        wake();
+      }, kept.shown),
+    ] : []];
+  }));
+  const again = [...place.children].find(one => one.textContent === focus);
+  if (again instanceof HTMLElement) again.focus();
 }
 
 /** The answers of the rig to this page. */
@@ -196,6 +239,9 @@ function answers() {
     answered = answer.number;
     const place = element('taken');
     if (answer.refused) problem(words.answered(answer));
+    // Also beside the parameter.
+    if (answer.refused) ofRig.get(answer.number)?.(answer.refused);
+    ofRig.delete(answer.number);
     place.hidden = !!answer.refused || answer.cycle === null;
     if (!place.hidden) place.textContent = words.taken(answer);
   }
@@ -234,7 +280,7 @@ function begin(/** @type {any} */ is) {
     one.plot.title = words.time;
     follow(one.plot);
   });
-  plots.filter(one => one.plot.plane).forEach(one => { one.plot.title = hello.signals[one.canvas.against].unit; });
+  plots.filter(one => one.plot.plane).forEach(presses);
   plots.forEach(names);
   watcher.disconnect();
   seen.clear();
@@ -242,6 +288,7 @@ function begin(/** @type {any} */ is) {
   const unit = element('knobs');
   unit.hidden = hello.knobs.length === 0 || !!saved;
   const rig = hello.kind === 'rig';
+  slots();
   knobs = unit.hidden ? null : new Knobs(element('rows'), hello.knobs, rig ? command : say, rig);
   for (const id of ['undo', 'text']) element(id).hidden = rig;
   keptOf.clear();
@@ -263,7 +310,7 @@ function begin(/** @type {any} */ is) {
     knobs.onundo();
   }
   listed = '';
-  if (saved) for (const one of plots) for (const curve of link.saved) place(one, curve, true);
+  if (saved) for (const one of plots) for (const curve of link.saved) placed(one, curve, true);
   asked = false;
   resize();
 }
@@ -285,7 +332,7 @@ function parts(curve) {
 }
 
 /** A curve of a saved report belongs to every canvas that has its signal. @param {any} one @param {any} curve @param {boolean} fromFile */
-function place(one, curve, fromFile) {
+function placed(one, curve, fromFile) {
   const { signal } = parts(curve.curve), { signals, against } = one.canvas;
   const numbers = (/** @type {(number | null)[]} */ all) => Float64Array.from(all, x => x ?? NaN);
   if (!fromFile || !signals.includes(signal)) return;
@@ -303,6 +350,7 @@ function look(canvas, curve) {
   const { signal, case: at, layer } = parts(curve), several = hello.cases.length > 1;
   const order = canvas.signals.indexOf(signal);
   const base = layer === baseLayer();
+  if (layer === 3 && hello.kind !== 'what if') return { colour: '--faint', dash: [2, 3], ghost: true };
   if (!base && (layer === 0 || hello.kind !== 'what if')) return { colour: '--ghost', dash: [5, 4], ghost: true };
   const own = several ? COLOURS[at % 4] : COLOURS[order % 4];
   const dash = several ? DASHES[(order + Math.floor(at / 4)) % 4] : DASHES[Math.floor(order / 4) % 4];
@@ -312,6 +360,49 @@ function look(canvas, curve) {
 /** The layer of the latest run; a recording has one layer. */
 function baseLayer() {
   return hello.kind === 'what if' ? 1 : 0;
+}
+
+/** The models that fit each slot, one press each. */
+function slots() {
+  const place = element('models'), focus = document.activeElement?.closest('#models') && document.activeElement.textContent;
+  place.replaceChildren(...(saved ? [] : hello.slots ?? []).map((/** @type {any} */ slot, /** @type {number} */ at) => {
+    const group = document.createElement('div'), name = document.createElement('b');
+    group.setAttribute('role', 'group');
+    group.setAttribute('aria-label', words.slot(slot.path, slot.interface));
+    name.textContent = slot.path;
+    group.append(name, ...slot.fits.map((/** @type {string} */ model) => {
+      const made = button(model, () => say(`slot ${slot.path} = ${model}`, problem), false);
+      made.dataset.slot = String(at);
+      return made;
+    }));
+    return group;
+  }));
+  // The one that was pressed is pressed again, and keeps the focus.
+  for (const one of place.querySelectorAll('button')) if (focus && one.textContent === focus) one.focus();
+}
+
+/** A canvas in the plane of a contact shows its force over speed or position, or its speed over position: one press each. @param {{ plot: Plot, canvas: any, curves: Map<number, any> }} one */
+function presses(one) {
+  const { canvas, plot } = one, phase = (hello.phases ?? []).find((/** @type {any} */ of) => of.speed === canvas.against && of.force === canvas.signals[0]);
+  plot.title = hello.signals[canvas.against].unit;
+  if (!phase || phase.position === null) return;
+  const place = document.createElement('div'), label = (/** @type {number} */ signal) => hello.signals[signal].label;
+  place.className = 'presses';
+  place.setAttribute('role', 'group');
+  place.setAttribute('aria-label', words.plane(label(phase.force), label(phase.speed)));
+  const made = [[phase.force, phase.speed], [phase.force, phase.position], [phase.speed, phase.position]].map(([y, x]) => button(words.plane(label(y), label(x)), () => {
+    one.canvas = { signals: [y], against: x };
+    one.curves.clear();
+    [plot.empty, plot.title] = [true, hello.signals[x].unit];
+    made.forEach(other => other.setAttribute('aria-pressed', String(other === made.find(own => own.textContent === words.plane(label(y), label(x))))));
+    names(one);
+    if (saved) for (const curve of link.saved) placed(one, curve, true);
+    asked = false;
+    tell();
+    wake();
+  }, y === canvas.signals[0] && x === canvas.against));
+  place.replaceChildren(...made);
+  plot.root.prepend(place);
 }
 
 /** @param {{ plot: Plot, canvas: any }} one */
@@ -354,7 +445,7 @@ function ask() {
   plots.forEach((one, id) => {
     const { signals, against } = one.canvas, at = newest ? `last ${lasts()}` : window_ ? `${window_[0]} ${window_[1]}` : 'all';
     if (against === null) link.send(`view ${id} ${signals.join(',')} ${at} ${one.plot.columns()}`);
-    else link.send(`path ${id} ${against},${signals[0]} ${at}`);
+    else link.send(`path ${id} ${against},${signals[0]} ${newest ? `last ${Math.min(lasts(), PHASE)}` : at}`);
   });
   askedFor = newest ? lasts() : 0;
   asked = true;
@@ -544,6 +635,13 @@ function show() {
       ...(state.kept[i] ? [button(words.go(letter), () => { knobs?.touch(-2); knobs?.release(); say(`go ${letter}`, problem); })] : []),
     ]));
   }
+  for (const one of element('models').querySelectorAll('button')) {
+    const there = String(state.models?.[Number(one.dataset.slot)] === one.textContent), group = one.parentElement;
+    if (one.getAttribute('aria-pressed') === there || !group) continue;
+    one.setAttribute('aria-pressed', there);
+    // The model that is there is in sight.
+    if (there === 'true') group.scrollTop = one.offsetTop - group.offsetTop - one.offsetHeight;
+  }
   const verdicts = state.run?.verdicts ?? [];
   element('verdicts').hidden = verdicts.length === 0;
   const before = document.activeElement;
@@ -566,13 +664,21 @@ function legend() {
   if (hello.kind !== 'what if') {
     const there = state.layers[1] || state.layers[2], text = free || !state.layers[2] ? words.twin : words.ahead;
     element('free').hidden = !(state.layers[1] && state.layers[2]);
-    if (place.textContent === (there ? text : '')) return;
-    const item = document.createElement('span'), line = document.createElement('canvas');
-    line.className = 'sample';
-    line.setAttribute('aria-hidden', 'true');
-    item.append(line, text);
-    place.replaceChildren(...there ? [item] : []);
-    return void requestAnimationFrame(() => sample(line, '--ghost', [5, 4]));
+    const kept = [...keptOf].filter(([, one]) => one.shown).map(([letter]) => letter).sort();
+    const entries = [
+      ...there ? [{ text, colour: '--ghost', dash: [5, 4] }] : [],
+      ...state.layers[3] ? [{ text: words.steady, colour: '--faint', dash: [2, 3] }] : [],
+      ...kept.map(letter => ({ text: letter, colour: '--c0', dash: KEPT_DASHES[letter] })),
+    ];
+    if (place.textContent === entries.map(one => one.text).join('')) return;
+    return place.replaceChildren(...entries.map(one => {
+      const item = document.createElement('span'), line = document.createElement('canvas');
+      line.className = 'sample';
+      line.setAttribute('aria-hidden', 'true');
+      item.append(line, one.text);
+      requestAnimationFrame(() => sample(line, one.colour, one.dash));
+      return item;
+    }));
   }
   const shown = state.layers.map((/** @type {boolean} */ drawn, /** @type {number} */ layer) => ({ drawn, layer })).filter((/** @type {any} */ one) => one.drawn && words.drawn[one.layer] && hello.kind === 'what if');
   place.replaceChildren(...shown.map((/** @type {any} */ one) => {
@@ -660,10 +766,12 @@ function picture(one) {
     const { signal, layer } = parts(number);
     // A frame that was on its way when the experiment changed may hold curves of other canvases.
     if (!state.layers[layer] || !drawn(layer) || !canvas.signals.includes(signal)) continue;
-    lines.push({ ...curve, ...look(canvas, number), curve: number, step: hello.signals[signal].boolean, layer });
+    const fades = plot.plane && layer === 0 && !!newest && hello.kind !== 'what if';
+    lines.push({ ...curve, ...look(canvas, number), curve: number, step: hello.signals[signal].boolean, layer, fades });
   }
   // The latest run on top.
   lines.sort((a, b) => Number(b.ghost) - Number(a.ghost));
+  for (const [letter, kept] of keptOf) if (kept.shown) lines.push(...ghosts(one, letter, kept));
   plot.draw(lines, plot.plane ? null : span(), !plot.plane && !!newest && !!state.grows && !printing);
   if (!plot.plane) plot.drawMarks(pointer, state.events ?? [], [...cursorTimes() ?? [], ...trigger?.at ? [trigger.at] : []]);
   // Nobody reads numbers faster, and each new text is a new layout.

@@ -38,6 +38,8 @@ function colour(ctx, name) {
 
 /** Seconds before the right edge in which a moving picture is drawn anew each time: the last column grows. */
 const ANEW = 0.3;
+/** Shades of a path that fades. */
+const FADES = 8;
 /** On and off in the dashes of a moving line, pixels: they are counted from time 0 and so move with it. */
 const MOVING_DASH = [5, 4];
 
@@ -64,7 +66,7 @@ export function sample(canvas, name, dash) {
 }
 
 /**
- * @typedef {{ x: Float64Array, y: Float64Array, colour: string, dash: number[], ghost: boolean, step: boolean, curve: number }} Line
+ * @typedef {{ x: Float64Array, y: Float64Array, colour: string, dash: number[], ghost: boolean, step: boolean, curve: number, still?: boolean, by?: number, fades?: boolean }} Line
  */
 
 /** One canvas with its axes, over time (`plane` false) or in the plane. */
@@ -146,7 +148,7 @@ export class Plot {
     let low = Infinity, high = -Infinity, left = Infinity, right = -Infinity;
     for (const line of lines) {
       for (let i = 0; i < line.x.length; i++) {
-        const x = line.x[i], y = line.y[i];
+        const x = line.x[i] + (line.by ?? 0), y = line.y[i];
         if (span && (x < span[0] || x > span[1]) || !Number.isFinite(y)) continue;
         if (y < low) low = y;
         if (y > high) high = y;
@@ -167,6 +169,8 @@ export class Plot {
     }
     if (span) this.span = span; else this.span = /** @type {[number, number]} */ (airy(left, right));
     this.drawGrid();
+    this.drawStill(lines.filter(line => line.still));
+    lines = lines.filter(line => !line.still);
     const bottom = this.height - BOTTOM, edge = this.width - RIGHT;
     const key = moves ? [each, this.range, themes.map(one => one.matches), lines.map(line => [line.colour, line.dash, line.curve])].join() : '';
     const by = moves && this.moved?.key === key ? n - this.moved.n : -1;
@@ -199,6 +203,10 @@ export class Plot {
     for (const line of lines) {
       ctx.strokeStyle = colour(ctx, line.colour);
       ctx.lineWidth = line.ghost ? 1.3 : 1.6;
+      if (line.fades) {
+        this.fading(ctx, line);
+        continue;
+      }
       const dashes = moves && line.dash.length > 0;
       ctx.setLineDash(dashes ? [] : line.dash);
       ctx.beginPath();
@@ -225,6 +233,45 @@ export class Plot {
     ctx.setTransform(devicePixelRatio, 0, 0, devicePixelRatio, 0, 0);
     ctx.clearRect(0, 0, this.width, this.height);
     return ctx;
+  }
+
+  /** Lines that stand still while others move: below these, with the grid. @param {Line[]} lines */
+  drawStill(lines) {
+    if (lines.length === 0) return;
+    const ctx = /** @type {CanvasRenderingContext2D} */ (this.grid.getContext('2d'));
+    ctx.save();
+    ctx.beginPath();
+    ctx.rect(LEFT, TOP, this.width - LEFT - RIGHT, this.height - TOP - BOTTOM);
+    ctx.clip();
+    for (const line of lines) {
+      ctx.strokeStyle = colour(ctx, line.colour);
+      ctx.lineWidth = 1.3;
+      ctx.setLineDash(line.dash);
+      ctx.beginPath();
+      let pen = false;
+      line.x.forEach((x, i) => {
+        const px = this.atX(x + (line.by ?? 0)), py = this.atY(line.y[i]);
+        if (pen) ctx.lineTo(px, py); else if (Number.isFinite(py)) ctx.moveTo(px, py);
+        pen = Number.isFinite(py);
+      });
+      ctx.stroke();
+    }
+    ctx.restore();
+  }
+
+  /** A path whose older parts are fainter. @param {CanvasRenderingContext2D} ctx @param {Line} line */
+  fading(ctx, line) {
+    const n = line.x.length;
+    ctx.setLineDash(line.dash);
+    for (let part = 0; part < FADES; part++) {
+      ctx.globalAlpha = 0.2 + 0.8 * (part + 1) / FADES;
+      ctx.beginPath();
+      for (let i = Math.floor(n * part / FADES); i < Math.min(n, Math.floor(n * (part + 1) / FADES) + 1); i++) {
+        if (Number.isFinite(line.y[i])) ctx.lineTo(this.atX(line.x[i]), this.atY(line.y[i]));
+      }
+      ctx.stroke();
+    }
+    ctx.globalAlpha = 1;
   }
 
   drawGrid() {

@@ -8,6 +8,9 @@ export function number(x, digits) {
   return text.replaceAll('-', '−');
 }
 
+/** A page of this panel by its number; one of another panel has a name. @param {number | string} page */
+const named = page => typeof page === 'number' ? `page ${page}` : page;
+
 export const words = {
   curves: 'Curves',
   parameters: 'Parameters',
@@ -18,6 +21,9 @@ export const words = {
   go: (/** @type {string} */ letter) => `to ${letter}`,
   drawn: ['as the text', '', 'A', 'B'],
   set: 'These values for `fric run`, `fric sweep`, `fric hil`',
+  ghost: (/** @type {string} */ letter) => `curves of ${letter}`,
+  steady: 'steady curve of the contact',
+  slot: (/** @type {string} */ path, /** @type {string} */ kind) => `${path}: models that fit ${kind}`,
   goStaged: (/** @type {string} */ letter) => `prepare ${letter}`,
   none: 'nothing is changed',
   copy: 'copy',
@@ -28,10 +34,10 @@ export const words = {
   sure: { enable: 'Enable', arm: 'Press again to arm', again: 'Start again' },
   guest: 'you look on; Stop is yours too',
   youOperate: (/** @type {number} */ me) => `you operate (page ${me})`,
-  operates: (/** @type {number} */ page) => `page ${page} operates`,
-  asksYou: (/** @type {number} */ page) => `page ${page} asks to operate; without an answer it will, after 5 s`,
-  asked: (/** @type {number} */ page) => `page ${page} operates, and has 5 s to refuse`,
-  refusedYou: (/** @type {number} */ page) => `page ${page} operates, and has refused`,
+  operates: (/** @type {number | string} */ page) => `${named(page)} operates`,
+  asksYou: (/** @type {number | string} */ page) => `${named(page)} asks to operate; without an answer it will, after 5 s`,
+  asked: (/** @type {number | string} */ page) => `${named(page)} operates, and has 5 s to refuse`,
+  refusedYou: (/** @type {number | string} */ page) => `${named(page)} operates, and has refused`,
   take: 'Take over',
   refuse: 'Refuse',
   give: 'Hand over',

@@ -73,6 +73,14 @@ pub fn twin(played: &Arc<Played>, bell: &Bell) {
             }
         });
     }
+    if let Some((at, steady)) = played.recording().wants_steady() {
+        let (played, bell) = (played.clone(), bell.clone());
+        std::thread::spawn(move || {
+            let points = steady.curve();
+            played.recording().settles(at, points);
+            bell.ring();
+        });
+    }
     let Some(twin) = played.recording().wants_twin() else { return };
     let (played, bell) = (played.clone(), bell.clone());
     std::thread::spawn(move || {

@@ -9,6 +9,8 @@
 //!                   now NS                the time of its monotonic clock, several times a second
 //!                   energy SHARE CYCLES   the most that a contact gave back of what it can hold, and cycles without
 //!                                         prediction
+//!                   chair HOLDER ASKS REFUSED  who operates it, who asks to, who was refused: `PANEL.PAGE`, or `-`
+//!                   you PANEL             the number of this panel, if the rig can have several
 //!                   ok NUMBER CYCLE       the command of this number has been carried out, by this cycle of the log;
 //!                                         without CYCLE where none did
 //!                   refused NUMBER WORDS  it has not, and why
@@ -16,12 +18,12 @@
 //!                   again                 it may be started again
 //!                   anew                  it is being started again
 //!                   problem WORDS         what the panel cannot show, and why
-//! to the rig        NUMBER COMMAND        as at the prompt
-//!                   NUMBER @NS COMMAND    where the rig tells its time: the last one that came
+//! to the rig        NUMBER page PAGE COMMAND      as at the prompt; also `take`, `give`, `refuse`
+//!                   NUMBER page PAGE @NS COMMAND  where the rig tells its time: the last one that came
+//!                   here PAGE, left PAGE  a page is there, has gone
 //!                   seen                  a page has drawn a picture; at most ten times a second
 //! ```
 
-use crate::chair::Chair;
 use crate::frame::Frame;
 use crate::knob::Knob;
 use crate::line::{self, View};
@@ -31,6 +33,8 @@ use crate::subject::{Page, Subject};
 use crate::words::clean;
 use abi::live::{Live, Tunable};
 use abi::{Instance, Slot};
+use runtime::hil::chair::Seats;
+use runtime::hil::origin::Seat;
 use serde_json::{Value, json};
 use std::collections::{BTreeMap, VecDeque};
 use std::io::Write;
@@ -75,7 +79,9 @@ struct Inner {
     /// Share of energy given back, and cycles without prediction.
     energy: Option<(f64, u64)>,
     answers: VecDeque<Answer>,
-    chair: Chair,
+    /// The number of this panel at its rig.
+    panel: u16,
+    chair: Seats,
     /// When the rig was told last that it is seen.
     seen: Option<Instant>,
     /// The number of the run, from 0.
@@ -96,7 +102,8 @@ impl Inner {
             now: None,
             energy: None,
             answers: VecDeque::new(),
-            chair: Chair::default(),
+            panel: 0,
+            chair: Seats::default(),
             seen: None,
             run,
             changes: 1,
@@ -197,9 +204,18 @@ impl Operated {
                 *self.begun.write().unwrap_or_else(PoisonError::into_inner) = None;
                 // Who operates it, and the numbers of commands, go on.
                 let (run, changes) = (inner.run + 1, inner.changes);
-                let (chair, last, answers) = (inner.chair.clone(), inner.last, std::mem::take(&mut inner.answers));
-                *inner = Inner { chair, last, answers, changes, ..Inner::new(run) };
+                let (chair, panel, last) = (inner.chair, inner.panel, inner.last);
+                let answers = std::mem::take(&mut inner.answers);
+                *inner = Inner { chair, panel, last, answers, changes, ..Inner::new(run) };
             }
+            "chair" => match Seats::of(rest) {
+                Some(seats) => inner.chair = seats,
+                None => return,
+            },
+            "you" => match rest.parse() {
+                Ok(panel) => inner.panel = panel,
+                Err(_) => return,
+            },
             "problem" => inner.problem = Some(rest.into()),
             "energy" => {
                 let numbers = rest.split_once(' ');
@@ -247,38 +263,6 @@ impl Operated {
     }
 }
 
-impl Operated {
-    /// A page is there, or has gone: that may change who operates.
-    fn attends(&self, page: Page, there: bool) {
-        let (mut inner, now) = (self.inner(), Instant::now());
-        let before = inner.chair.json();
-        if there {
-            inner.chair.heard(page.number, now);
-        } else {
-            inner.chair.left(page.number, now);
-        }
-        if inner.chair.json() != before {
-            inner.changes += 1;
-            drop(inner);
-            self.bell.ring();
-        }
-    }
-
-    /// Who operates: asked, refused, given.
-    fn seat(&self, page: Page, words: &str) -> Result<String, String> {
-        let (mut inner, now) = (self.inner(), Instant::now());
-        let done = match words {
-            "take" => inner.chair.take(page.number, now),
-            "give" => inner.chair.answer(page.number, true, now),
-            _ => inner.chair.answer(page.number, false, now),
-        };
-        inner.changes += 1;
-        drop(inner);
-        self.bell.ring();
-        done.map(|()| String::new())
-    }
-}
-
 impl Subject for Operated {
     fn hello(&self) -> (u64, Value) {
         let (run, begun) = (self.run(), self.begun());
@@ -287,7 +271,7 @@ impl Subject for Operated {
             None => (
                 2 * run + 1,
                 json!({
-                    "title": clean(&self.name), "experiments": [], "cases": [""], "signals": [], "canvases": [],
+                    "title": clean(&self.name), "experiments": [], "cases": [""], "signals": [], "canvases": [], "phases": [],
                     "from": 0, "to": 0, "period": 0.001, "solver": "", "grows": true,
                 }),
             ),
@@ -321,8 +305,22 @@ impl Subject for Operated {
         value["next"] = inner.next.clone().into();
         value["over"] = inner.over.as_deref().map(clean).into();
         value["answers"] = inner.answers.iter().map(Answer::json).collect();
-        value["chair"] = inner.chair.json();
+        // A page knows those of its own panel by their numbers.
+        let named = |seat: Option<Seat>| match seat {
+            Some(seat) if seat.panel == inner.panel => seat.page.into(),
+            Some(seat) => seat.to_string().into(),
+            None => Value::Null,
+        };
+        let Seats { holder, asks, refused } = inner.chair;
+        value["chair"] = json!({ "holder": named(holder), "asks": named(asks), "refused": named(refused) });
         (told + inner.changes, value)
+    }
+
+    fn numbers(&self) -> (u64, u64) {
+        let begun = self.begun();
+        let told = begun.as_ref().map_or(0, |begun| begun.played.recording().told());
+        let inner = self.inner();
+        (2 * inner.run + 1 + u64::from(begun.is_some()), told + inner.changes)
     }
 
     fn version(&self) -> u64 {
@@ -346,11 +344,13 @@ impl Subject for Operated {
     }
 
     fn here(&self, page: Page) {
-        self.attends(page, true);
+        // One that only looks has no part in who operates.
+        if !page.guest {
+            let _ = self.say_line(&format!("here {}", page.number));
+        }
     }
 
     fn drew(&self, page: Page) {
-        self.attends(page, true);
         let mut inner = self.inner();
         if page.guest || inner.seen.is_some_and(|seen| seen.elapsed() < SEEN) {
             return;
@@ -361,7 +361,9 @@ impl Subject for Operated {
     }
 
     fn left(&self, page: Page) {
-        self.attends(page, false);
+        if !page.guest {
+            let _ = self.say_line(&format!("left {}", page.number));
+        }
     }
 
     fn say(&self, page: Page, words: &str) -> Result<String, String> {
@@ -371,15 +373,12 @@ impl Subject for Operated {
         }
         // A stop is obeyed with any age, and before anything else is asked.
         let stops = words == "stop";
-        if let "take" | "give" | "refuse" = words {
-            return self.seat(page, words);
-        }
+        let seats = matches!(words, "take" | "give" | "refuse");
         if words == "again" {
             if self.inner().next != "again" {
                 return Err("the rig cannot be started again now".into());
             }
-            self.inner().chair.command(page.number, Instant::now())?;
-        } else if !stops {
+        } else if !stops && !seats {
             let begins = |word: &str| words.strip_prefix(word).is_some_and(|rest| rest.starts_with(' '));
             if words != "enable" && words != "arm" && !begins("set") && !begins("mark") {
                 return Err("say enable, arm, set PATH = VALUE, mark WORDS, take, give, refuse, again or stop".into());
@@ -393,7 +392,6 @@ impl Subject for Operated {
             if !(-OLD..=OLD).contains(&age) {
                 return Err(format!("it was given before a picture that is {age:.1} s old: look, and give it again"));
             }
-            self.inner().chair.command(page.number, Instant::now())?;
         }
         let (number, now) = {
             let mut inner = self.inner();
@@ -404,12 +402,10 @@ impl Subject for Operated {
             if inner.open.len() > OPEN {
                 inner.open.pop_first();
             }
-            (number, inner.now.filter(|_| !stops && words != "again"))
+            (number, inner.now.filter(|_| !stops && !seats && words != "again"))
         };
         let stamp = now.map_or(String::new(), |ns| format!("@{ns} "));
-        self.say_line(&format!("{number} {stamp}{words}"))?;
-        // Who operates may have changed.
-        self.bell.ring();
+        self.say_line(&format!("{number} page {} {stamp}{words}", page.number))?;
         Ok(number.to_string())
     }
 }
@@ -475,7 +471,7 @@ mod tests {
                     passed += 1;
                     assert_eq!(
                         (result.as_deref(), written),
-                        (Ok("1"), format!("1 {}\n", if stops { "stop" } else { words })),
+                        (Ok("1"), format!("1 page 1 {}\n", if stops { "stop" } else { words })),
                         "{said:?}"
                     );
                 }
@@ -508,7 +504,11 @@ mod tests {
         operated.told("now 123");
         operated.say(ONE, "@0 enable").unwrap();
         operated.say(ONE, "stop").unwrap();
-        assert!(String::from_utf8(lines.0.lock().unwrap().clone()).unwrap().ends_with("2 @123 enable\n3 stop\n"));
+        assert!(
+            String::from_utf8(lines.0.lock().unwrap().clone())
+                .unwrap()
+                .ends_with("2 page 1 @123 enable\n3 page 1 stop\n")
+        );
         operated.told("over stopped: enabling switch released");
         assert!(operated.say(ONE, "@0 arm").is_err_and(|why| why.contains("enabling switch released")));
         assert!(operated.say(ONE, "stop").is_ok());
@@ -520,6 +520,7 @@ mod tests {
         assert_eq!(operated.state().1["next"], "again");
         let hello = operated.hello().0;
         operated.say(ONE, "again").unwrap();
+        operated.told("chair 0.1 - -");
         operated.told("anew");
         let (number, state) = operated.state();
         assert!(number > after && operated.hello().0 > hello && operated.run() == 1);
@@ -530,11 +531,10 @@ mod tests {
     }
 
     /// Random commands of three pages and a rig that answers them in any order: each answer goes to the page that asked,
-    /// with the cycle that took it; a command of a page that does not operate is not passed on, and each stop is.
-    ///
-    /// Mutants tried: the answer to the last page that asked; a stop that needs the chair; a chair that nobody keeps.
+    /// with the cycle that took it, and each line to the rig names its page. Who operates is what the rig says, in the
+    /// words of each panel.
     #[test]
-    fn each_page_gets_its_own_answers_and_only_one_operates() {
+    fn each_page_gets_its_own_answers_and_sees_who_operates() {
         for seed in 1..=300_u64 {
             let mut state = seed;
             let mut below = |n: u64| {
@@ -542,50 +542,44 @@ mod tests {
                 (state >> 33) % n
             };
             let (operated, lines) = open();
-            let (mut waiting, mut holder, mut last) = (Vec::new(), None, 0);
+            let own = below(3);
+            operated.told(&format!("you {own}"));
+            let (mut waiting, mut last) = (Vec::new(), 0);
             for cycle in 0..80 {
                 let page = Page { number: 1 + below(3), guest: false };
                 let before = lines.0.lock().unwrap().len();
                 match below(6) {
-                    0 => {
-                        operated.left(page);
-                        holder = holder.filter(|holder| *holder != page.number);
-                    }
-                    1 => {
-                        operated.say(page, "@-99 stop").unwrap();
+                    0 => operated.left(page),
+                    1 | 2 if below(2) == 0 || waiting.is_empty() => {
+                        let words = ["@-99 stop", "stop", "take", "give", "refuse"][below(5) as usize];
+                        operated.say(page, words).unwrap();
                         last += 1;
-                        assert_eq!(
-                            &lines.0.lock().unwrap()[before..],
-                            format!("{last} stop\n").as_bytes(),
-                            "seed {seed}"
-                        );
+                        let line = format!("{last} page {} {}\n", page.number, words.trim_start_matches("@-99 "));
+                        assert_eq!(&lines.0.lock().unwrap()[before..], line.as_bytes(), "seed {seed}");
                     }
-                    2 if !waiting.is_empty() => {
+                    1 | 2 => {
                         let (number, page): (u64, u64) = waiting.remove(below(waiting.len() as u64) as usize);
                         operated.told(&format!("ok {number} {cycle}"));
                         let told = operated.state().1["answers"].as_array().unwrap().last().unwrap().clone();
                         let found = (told["number"].as_u64(), told["page"].as_u64(), told["cycle"].as_u64());
                         assert_eq!(found, (Some(number), Some(page), Some(cycle)), "seed {seed}");
                     }
+                    3 => {
+                        let (panel, holder) = (below(3), 1 + below(3));
+                        operated.told(&format!("chair {panel}.{holder} - -"));
+                        let told = operated.state().1["chair"]["holder"].clone();
+                        let same = panel == own;
+                        assert_eq!(told.as_u64(), same.then_some(holder), "seed {seed}: {told}");
+                        assert!(same || told.as_str().is_some_and(|it| it.starts_with(&format!("page {holder}"))));
+                    }
                     _ => {
-                        let result = operated.say(page, "@0 set a = 1");
-                        let mine = holder.is_none_or(|holder| holder == page.number);
-                        assert_eq!(
-                            result.is_ok(),
-                            mine,
-                            "seed {seed}: page {} while {holder:?}: {result:?}",
-                            page.number
-                        );
-                        if mine {
-                            last += 1;
-                            waiting.push((last, page.number));
-                            holder = Some(page.number);
-                        } else {
-                            assert_eq!(lines.0.lock().unwrap().len(), before, "seed {seed}");
-                        }
+                        operated.say(page, "@0 set a = 1").unwrap();
+                        last += 1;
+                        waiting.push((last, page.number));
+                        let line = format!("{last} page {} set a = 1\n", page.number);
+                        assert_eq!(&lines.0.lock().unwrap()[before..], line.as_bytes(), "seed {seed}");
                     }
                 }
-                assert_eq!(operated.state().1["chair"]["holder"].as_u64(), holder, "seed {seed}");
             }
         }
     }

@@ -6,7 +6,8 @@
 use crate::frame::{Block, COLUMNS, Frame, PATH};
 use crate::history::History;
 use crate::line::{View, Window};
-use crate::sheet::{Sheet, Signal};
+use crate::sheet::{Phase, Sheet, Signal};
+use crate::steady::Steady;
 use crate::subject::{Page, Subject};
 use crate::thin;
 use crate::twin::{Ahead, COARSE, Difference, Short, State, Twin};
@@ -16,11 +17,13 @@ use abi::rig::{Rig, SignalKind};
 use abi::{Description, Instance, Slot};
 use runtime::can::frame_length;
 use runtime::hil::control::{Control, Reading, Source};
+use runtime::hil::origin::Origin;
 use runtime::hil::trace::{self, Cycle, Passed, Shape};
 use runtime::hil::words;
 use runtime::record::log::{LOST, Message};
 use runtime::safety::{Clamps, DriveCommand};
 use serde_json::{Value, json};
+use std::cell::RefCell;
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
@@ -30,6 +33,14 @@ const EVENTS: usize = 2000;
 /// Bars of a decade in the histogram of lateness, and of all of it, from 1 µs.
 const PARTS: usize = 6;
 const BARS: usize = 5 * PARTS;
+/// The layer of steady curves, after the recording, the dry run and the short ones.
+const STEADY: u32 = 3;
+/// Signals and cycles of a picture in the plane: x, y, from, to.
+type Path = (u32, u32, u64, u64);
+/// Its points, for all who ask for it.
+type Picture = Arc<Vec<(f64, f64)>>;
+/// Pictures that are kept.
+const PATHS: usize = 8;
 /// Points of a path.
 const PATH_POINTS: u64 = 60_000;
 
@@ -70,6 +81,22 @@ impl Load {
     }
 }
 
+/// The steady curve of a contact.
+struct Settles {
+    phase: Phase,
+    /// The greatest speed so far, SI.
+    most: f64,
+    /// The greatest speed for which the curve was made, the sets before it, and when.
+    made: Option<(f64, usize, Instant)>,
+    points: Vec<(f64, f64)>,
+    /// Where the data ended when it came.
+    from: u64,
+}
+
+/// Growth of the greatest speed from which a steady curve is made anew, and the least time between two.
+const WIDER: f64 = 1.25;
+const SETTLES: Duration = Duration::from_secs(1);
+
 /// A recording.
 pub struct Recording {
     name: String,
@@ -96,8 +123,11 @@ pub struct Recording {
     first: Option<u64>,
     /// Number of what [`Subject::state`] tells, and when it changed last.
     told: (u64, Instant),
-    /// Parameters that were set while it ran, SI.
+    /// Who gave the command that was carried out last, when, and its name.
+    said: Option<(u64, &'static str, Origin)>,
+    /// Parameters that were set while it ran, SI, and the number of sets.
     set: BTreeMap<Slot, f64>,
+    sets: usize,
     /// Both programs of the rig at their start.
     programs: Arc<(Instance, Instance)>,
     /// Whether the dry run from arming on has been begun.
@@ -118,6 +148,10 @@ pub struct Recording {
     ahead: (VecDeque<Ahead>, u64),
     /// The newest short run that is over, and how much the recording differs from it.
     judged: (Option<u64>, Vec<Option<f64>>),
+    /// The steady curves of its contacts.
+    curves_of: Vec<Settles>,
+    /// Pictures in the plane, the newest.
+    paths: RefCell<VecDeque<(Path, Picture)>>,
     /// Whether somebody makes short runs.
     running: bool,
     buses: Vec<Load>,
@@ -157,6 +191,11 @@ impl Recording {
         sheet.place(&others, None);
         sheet.place(&(begin..begin + readings).collect::<Vec<_>>(), None);
         sheet.place(&(begin + readings..sheet.signals.len()).collect::<Vec<_>>(), None);
+        sheet.place_phases();
+        // Readings and commands are no quantities of the model.
+        let phases = sheet.phases().into_iter().filter(|phase| phase.force.max(phase.speed) < rig.record.len());
+        let settles = |phase| Settles { phase, most: 0.0, made: None, points: Vec::new(), from: 0 };
+        let curves_of = phases.map(settles).collect();
         let count = sheet.signals.len();
         Recording {
             name: name.into(),
@@ -178,7 +217,10 @@ impl Recording {
             ends: None,
             first: None,
             told: (1, Instant::now()),
+            said: None,
             set: BTreeMap::new(),
+            sets: 0,
+            curves_of,
             programs: Arc::new((programs.0.clone(), programs.1.clone())),
             twins: false,
             armed: None,
@@ -190,6 +232,7 @@ impl Recording {
             states: VecDeque::new(),
             ahead: (VecDeque::new(), 0),
             judged: (None, Vec::new()),
+            paths: RefCell::default(),
             running: false,
             buses: rig.buses.iter().map(|_| Load::default()).collect(),
         }
@@ -224,9 +267,18 @@ impl Recording {
                 self.state_of_cycle(&message.words);
                 true
             }
+            trace::COMMAND => {
+                // A command of a later version is no reason to show nothing.
+                self.said = trace::read_command(&message.words);
+                if let Some((due_ns, name @ ("enable" | "arm" | "stop"), origin)) = self.said {
+                    self.event(due_ns / self.rig.period_ns, "said", format!("{name}, by {origin}"));
+                }
+                true
+            }
             trace::MARK => match trace::read_mark(&message.words) {
                 Some((due_ns, words)) => {
-                    self.event(due_ns / self.rig.period_ns, "mark", words);
+                    let by = self.said_by(due_ns, "mark");
+                    self.event(due_ns / self.rig.period_ns, "mark", format!("{words}{by}"));
                     true
                 }
                 None => false,
@@ -268,6 +320,37 @@ impl Recording {
         let (control, plant) = (*self.programs).clone();
         self.twins = true;
         Some(Twin { rig: self.rig.clone(), control, plant, set: set.clone(), at: self.seconds(*at) })
+    }
+
+    /// A steady curve that is to be made, and its number: for other values of parameters, or greater speeds.
+    pub fn wants_steady(&mut self) -> Option<(usize, Steady)> {
+        let sets = self.sets;
+        let due = |one: &Settles| match one.made {
+            None => one.most > 0.0,
+            Some((most, before, at)) => {
+                (one.most > WIDER * most || before != sets) && (at.elapsed() > SETTLES || self.ends.is_some())
+            }
+        };
+        let at = self.curves_of.iter().position(due)?;
+        let one = &mut self.curves_of[at];
+        one.made = Some((one.most, sets, Instant::now()));
+        let series = |signal: usize| self.rig.record[signal].clone();
+        let steady = Steady {
+            rig: self.rig.clone(),
+            control: self.programs.0.clone(),
+            set: self.set.iter().map(|(slot, si)| (*slot, *si)).collect(),
+            force: series(one.phase.force),
+            speed: series(one.phase.speed),
+            most: one.most,
+        };
+        Some((at, steady))
+    }
+
+    /// Shows a steady curve.
+    pub fn settles(&mut self, at: usize, points: Vec<(f64, f64)>) {
+        let end = self.history.cycles().end;
+        (self.curves_of[at].points, self.curves_of[at].from) = (points, end);
+        self.tell();
     }
 
     /// Keeps a full state: the next short run starts there.
@@ -416,6 +499,12 @@ impl Recording {
         for (place, value) in self.row.iter_mut().zip(recorded.chain(readings).chain(commands)) {
             *place = value;
         }
+        for one in &mut self.curves_of {
+            let speed = cycle.recorded.get(one.phase.speed).map_or(0.0, |speed| speed.abs());
+            if speed > one.most && speed.is_finite() {
+                one.most = speed;
+            }
+        }
         self.history.push(at, &self.row);
         let t = self.seconds(at);
         for ((difference, twin), value) in self.differences.iter_mut().zip(&self.twin).zip(&self.row) {
@@ -440,7 +529,8 @@ impl Recording {
         }
         for (slot, si) in &cycle.set {
             self.set.insert(*slot, *si);
-            let text = self.words_of_set(*slot, *si);
+            self.sets += 1;
+            let text = self.words_of_set(*slot, *si) + &self.said_by(cycle.due_ns, "set");
             self.event(at, "set", text);
         }
         for cause in &cycle.causes {
@@ -452,6 +542,14 @@ impl Recording {
         }
         for (output, clamps) in cycle.clamps.iter().enumerate() {
             self.clamp(output, at, *clamps);
+        }
+    }
+
+    /// Who gave this command at this time, as the end of a sentence; empty where the log does not say.
+    fn said_by(&self, due_ns: u64, name: &str) -> String {
+        match self.said {
+            Some((then_ns, said, origin)) if (then_ns, said) == (due_ns, name) => format!(", by {origin}"),
+            _ => String::new(),
         }
     }
 
@@ -572,6 +670,7 @@ impl Recording {
             "cases": [""],
             "signals": signals,
             "canvases": canvases,
+            "phases": self.sheet.phases_json(),
             "knobs": [],
             "from": from,
             "to": to,
@@ -601,7 +700,12 @@ impl Recording {
         json!({
             "values": [],
             "texts": [],
-            "layers": [true, !self.twin.is_empty(), !self.ahead.0.is_empty()],
+            "layers": [
+                true,
+                !self.twin.is_empty(),
+                !self.ahead.0.is_empty(),
+                self.curves_of.iter().any(|one| !one.points.is_empty()),
+            ],
             "kept": [],
             "rms": self.differences.iter().map(Difference::rms).collect::<Vec<_>>(),
             "ahead": self.judged.1,
@@ -689,6 +793,23 @@ impl Recording {
         }
     }
 
+    /// The picture of one signal over another in some cycles. All viewers that follow the newest ask for the same one.
+    fn path(&self, asked: Path) -> Picture {
+        let mut paths = self.paths.borrow_mut();
+        if let Some((_, points)) = paths.iter().find(|(other, _)| *other == asked) {
+            return points.clone();
+        }
+        let (x, y, from, to) = asked;
+        let value = |signal: u32, cycle| self.history.value(signal as usize, cycle);
+        let points: Vec<(f64, f64)> = (from..to).map(|cycle| (value(x, cycle), value(y, cycle))).collect();
+        let points = Arc::new(thin::path(&points));
+        if paths.len() == PATHS {
+            paths.pop_front();
+        }
+        paths.push_back((asked, points.clone()));
+        points
+    }
+
     fn blocks(&self, view: &View, since: Option<u64>, frame: &mut Frame) {
         let count = self.sheet.signals.len();
         if view.signals.iter().any(|signal| *signal as usize >= count) {
@@ -713,11 +834,17 @@ impl Recording {
             let (from, to) = view.window.within(begin, end);
             let (from, to) = (self.cycle_at(from).max(all.start), (self.cycle_at(to) + 1).min(all.end));
             let to = to.min(from.saturating_add(PATH_POINTS));
-            let value = |signal: u32, cycle| self.history.value(signal as usize, cycle);
-            let points: Vec<(f64, f64)> = (from..to).map(|cycle| (value(x, cycle), value(y, cycle))).collect();
-            let points = thin::path(&points);
+            let points = self.path((x, y, from, to));
             let first = points.first().map_or(0.0, |point| point.0);
             frame.path(Block { kind: PATH, view: view.id, curve: y, cycles: 0, first }, &points);
+            let shown = |one: &&Settles| (one.phase.speed, one.phase.force) == (x as usize, y as usize);
+            if let Some(one) = self.curves_of.iter().find(shown)
+                && since.is_none_or(|since| since <= one.from)
+            {
+                let first = one.points.first().map_or(0.0, |point| point.0);
+                let curve = STEADY * count as u32 + y;
+                frame.path(Block { kind: PATH, view: view.id, curve, cycles: 0, first }, &one.points);
+            }
         }
     }
 }
@@ -745,6 +872,10 @@ impl Subject for Played {
     fn state(&self) -> (u64, Value) {
         let recording = self.recording();
         (recording.told.0, recording.state())
+    }
+
+    fn numbers(&self) -> (u64, u64) {
+        (1, self.recording().told.0)
     }
 
     fn version(&self) -> u64 {

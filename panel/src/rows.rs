@@ -63,6 +63,9 @@ mod tests {
         fn state(&self) -> (u64, Value) {
             (1, Value::Null)
         }
+        fn numbers(&self) -> (u64, u64) {
+            (self.hello().0, self.state().0)
+        }
         fn version(&self) -> u64 {
             0
         }

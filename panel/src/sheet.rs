@@ -36,6 +36,18 @@ pub struct Sheet {
     canvases: Vec<(Vec<usize>, Option<usize>)>,
 }
 
+/// A contact in the plane, by the numbers of its signals: a page shows force over speed, force over position, or speed
+/// over position.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub struct Phase {
+    /// Its force.
+    pub force: usize,
+    /// Its speed, or that of its shaft.
+    pub speed: usize,
+    /// The position there.
+    pub position: Option<usize>,
+}
+
 /// Most curves of a canvas.
 const CURVES: usize = 4;
 
@@ -81,6 +93,46 @@ impl Sheet {
                 None => self.canvases.push((vec![*signal], against)),
             }
         }
+    }
+
+    /// The contacts among the signals: each `F` of a part, over what the text shows it, or else over the `v` of the same
+    /// part, or over the only `v` that there is. The position is the `x` of whose `v` that is.
+    pub fn phases(&self) -> Vec<Phase> {
+        let named = |label: &str, name: &str| {
+            label.strip_suffix(name).is_some_and(|part| part.is_empty() || part.ends_with('.'))
+        };
+        let find = |label: &str| self.signals.iter().position(|signal| signal.label == label);
+        let speeds: Vec<usize> = (0..self.signals.len()).filter(|at| named(&self.signals[*at].label, "v")).collect();
+        let phase = |force: usize| {
+            let label = &self.signals[force].label;
+            let part = label.strip_suffix('F').filter(|_| named(label, "F"))?;
+            let shown = self.canvases.iter().find(|(all, against)| against.is_some() && all.contains(&force));
+            let speed = match shown {
+                Some((_, over)) => over.filter(|over| speeds.contains(over)),
+                None => find(&format!("{part}v")).or(match speeds[..] {
+                    [only] => Some(only),
+                    _ => None,
+                }),
+            }?;
+            let whose = self.signals[speed].label.strip_suffix('v')?;
+            Some(Phase { force, speed, position: find(&format!("{whose}x")) })
+        };
+        (0..self.signals.len()).filter_map(phase).collect()
+    }
+
+    /// Adds a canvas for each contact that has none.
+    pub fn place_phases(&mut self) {
+        for Phase { force, speed, .. } in self.phases() {
+            if !self.canvases.contains(&(vec![force], Some(speed))) {
+                self.canvases.push((vec![force], Some(speed)));
+            }
+        }
+    }
+
+    /// The contacts, for the page.
+    pub fn phases_json(&self) -> Value {
+        let json = |Phase { force, speed, position }| json!({ "force": force, "speed": speed, "position": position });
+        self.phases().into_iter().map(json).collect()
     }
 
     /// For the page.
@@ -140,5 +192,38 @@ mod tests {
                 (vec![10], None)
             ]
         );
+    }
+
+    #[test]
+    fn a_force_stands_over_its_speed() {
+        let sheet = |labels: &[&str], planes: &[(usize, usize)]| {
+            let mut sheet = Sheet::default();
+            for label in labels {
+                let unit = Unit::parse("1").unwrap();
+                sheet.signal(Signal { label: (*label).into(), unit, boolean: false });
+            }
+            planes.iter().for_each(|(y, x)| sheet.place(&[*y], Some(*x)));
+            sheet
+        };
+        let phase = |force, speed, position| Phase { force, speed, position };
+        for (labels, planes, wanted) in [
+            // The speed of its own part first, then the only one.
+            (&["x", "v", "fr.F", "fr.v"][..], &[][..], &[phase(2, 3, None)][..]),
+            (&["body.x", "body.v", "fr.F"], &[], &[phase(2, 1, Some(0))]),
+            (&["x", "v", "F"], &[], &[phase(2, 1, Some(0))]),
+            (&["a.v", "b.v", "fr.F"], &[], &[]),
+            // What the text says comes before all.
+            (&["a.v", "b.v", "fr.F", "b.x"], &[(2, 1)], &[phase(2, 1, Some(3))]),
+            (&["x", "v", "fr.F"], &[(2, 0)], &[]),
+            (&["CF", "v", "conv", "F_load"], &[], &[]),
+        ] {
+            let mut sheet = sheet(labels, planes);
+            assert_eq!(sheet.phases(), wanted, "{labels:?} {planes:?}");
+            sheet.place_phases();
+            let count = sheet.canvases.len();
+            sheet.place_phases();
+            assert_eq!(sheet.canvases.len(), count);
+            assert!(wanted.iter().all(|one| sheet.canvases.contains(&(vec![one.force], Some(one.speed)))));
+        }
     }
 }

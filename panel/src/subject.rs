@@ -22,6 +22,9 @@ pub trait Subject: Send + Sync {
     /// What changes now and then, such as the values of parameters and verdicts, and its number.
     fn state(&self) -> (u64, Value);
 
+    /// The numbers of both, without making them: they are asked for with every frame.
+    fn numbers(&self) -> (u64, u64);
+
     /// A number that grows whenever any curve changes.
     fn version(&self) -> u64;
 

@@ -281,8 +281,9 @@ impl Viewer {
             if !free || !is_known() {
                 continue;
             }
-            let (number, value) = subject.hello();
-            if hello != Some(number) {
+            let numbers = subject.numbers();
+            if hello != Some(numbers.0) {
+                let (number, value) = subject.hello();
                 hello = Some(number);
                 state = None;
                 // Its numbers of signals mean others now: the page asks anew.
@@ -296,9 +297,9 @@ impl Viewer {
             }
             // The version first: what changes meanwhile goes out again, rather than never.
             let version = subject.version();
-            let (number, value) = subject.state();
-            let changed = state != Some(number);
+            let changed = state != Some(numbers.1);
             if changed {
+                let (number, value) = subject.state();
                 state = Some(number);
                 let text = json!({ "kind": "state", "number": number, "is": value }).to_string();
                 if socket.send(Message::text(text)).is_err() {

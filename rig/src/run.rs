@@ -9,15 +9,18 @@ use crate::words;
 use abi::rig::Rig;
 use runtime::can::Bus;
 use runtime::can::sim::Simulation;
+use runtime::hil::chair::{Chair, Line, Seats};
 use runtime::hil::cycle::{Attention, Command, End, Gauges};
 use runtime::hil::live::Judge;
 use runtime::hil::operator::{Answer, Mark, NO_RESET, Operator, Reason, Stamp, Stopper};
+use runtime::hil::origin::{Origin, Seat};
 use runtime::hil::session::{self, Drives, Session, Setup};
 use runtime::hil::simulated::World;
 use runtime::hil::{emergency, watches};
 use runtime::realtime::clock::Clock;
 use runtime::record::log::{Sections, Settings, Sink};
 use runtime::record::parts::{self, Limits};
+use std::collections::BTreeSet;
 use std::fs;
 use std::io::{BufRead, BufReader, Read, Take, Write};
 use std::net::{Shutdown, SocketAddr};
@@ -25,9 +28,9 @@ use std::os::unix::net::{UnixListener, UnixStream};
 use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Stdio};
-use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU16, AtomicUsize, Ordering};
 use std::sync::mpsc::{self, SyncSender};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 /// Interval at which the state is written and the installed package checked.
@@ -279,6 +282,8 @@ impl Attendant {
             attention,
             ended,
             panels,
+            numbers: AtomicU16::new(0),
+            chair: Mutex::default(),
         });
         let dir = wanted.dir.to_path_buf();
         let mut threads = Vec::new();
@@ -295,7 +300,7 @@ impl Attendant {
                         installed.as_ref().is_some_and(|store| store.current_target().as_ref() != Some(&target));
                     if other && idle && !replaced.swap(true, Ordering::Relaxed) {
                         // The rig ends with the cycle that accepts the command: no drive has torque then.
-                        stopper.stop();
+                        stopper.stop(Origin::Program);
                     }
                     std::thread::sleep(LOOK);
                 }
@@ -376,6 +381,18 @@ struct Desk {
     ended: Mutex<Option<String>>,
     /// Panels that are connected.
     panels: AtomicUsize,
+    /// The number of the latest panel.
+    numbers: AtomicU16,
+    /// Which page of all panels operates the rig.
+    chair: Mutex<Chair>,
+}
+
+/// A command of a panel that waits to be carried out.
+struct Waiting {
+    number: u64,
+    stamp: Stamp,
+    origin: Origin,
+    words: String,
 }
 
 /// What a panel must know to find the log of a run.
@@ -418,7 +435,10 @@ impl Desk {
         if line.trim() == "attend" {
             return self.attend_panel(stream, lines);
         }
-        let said = match self.carry_out(line.trim()) {
+        let stamped = line.trim().strip_prefix('@').and_then(|rest| rest.split_once(' '));
+        let stamped = stamped.and_then(|(ns, said)| Some((Stamp::Wall(ns.parse().ok()?), said)));
+        let (stamp, said) = stamped.unwrap_or((Stamp::wall(), line.trim()));
+        let said = match self.carry_out(said, stamp, Origin::Say) {
             Ok(Some(cycle)) => format!("ok {cycle}\n"),
             Ok(None) => "ok\n".into(),
             Err(why) => format!("{why}\n"),
@@ -438,12 +458,16 @@ impl Desk {
                 let (send, queue) = mpsc::sync_channel(WAITING);
                 let gone = AtomicBool::new(false);
                 let (gone, to) = (&gone, &to);
+                let panel = self.numbers.fetch_add(1, Ordering::Relaxed) + 1;
                 std::thread::scope(|scope| {
-                    scope.spawn(move || self.tell_stage(to, gone));
+                    scope.spawn(move || self.tell_stage(to, panel, gone));
                     scope.spawn(move || self.answer(to, &queue));
-                    self.listen(lines, to, &send);
+                    let pages = self.listen(lines, to, panel, &send);
                     gone.store(true, Ordering::Relaxed);
                     drop(send);
+                    // With the connection, its pages are gone.
+                    let (mut chair, now) = (self.chair(), Instant::now());
+                    pages.into_iter().for_each(|page| chair.left(Seat { panel, page }, now));
                 });
             }
         } else {
@@ -453,8 +477,9 @@ impl Desk {
     }
 
     /// Tells the stage, the time and the end of the run.
-    fn tell_stage(&self, to: &Mutex<&UnixStream>, gone: &AtomicBool) {
-        let (mut last, mut told, mut energy) = (String::new(), None::<Instant>, (0.0, 0));
+    fn tell_stage(&self, to: &Mutex<&UnixStream>, panel: u16, gone: &AtomicBool) {
+        let (mut last, mut told, mut energy, mut seats) = (String::new(), None::<Instant>, (0.0, 0), Seats::default());
+        tell_panel(to, &format!("you {panel}"));
         while !gone.load(Ordering::Relaxed) {
             let ended = self.ended.lock().unwrap_or_else(PoisonError::into_inner).clone();
             let stage = self.gauges.stage.get();
@@ -470,6 +495,11 @@ impl Desk {
                 energy = self.gauges.energy();
                 heard &= tell_panel(to, &format!("energy {} {}", energy.0, energy.1));
             }
+            let now = self.chair().seats();
+            if now != seats {
+                seats = now;
+                heard &= tell_panel(to, &format!("chair {seats}"));
+            }
             if let Some(words) = &ended {
                 tell_panel(to, &format!("over {words}"));
             }
@@ -481,40 +511,71 @@ impl Desk {
         }
     }
 
-    /// Reads commands. A stop is carried out here, whatever waits.
+    fn chair(&self) -> MutexGuard<'_, Chair> {
+        self.chair.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Reads what pages of a panel say, until it ends; returns the pages. A stop is carried out here, whatever waits.
     fn listen(
         &self,
         mut lines: BufReader<Take<&UnixStream>>,
         to: &Mutex<&UnixStream>,
-        send: &SyncSender<(u64, String)>,
-    ) {
-        let mut line = String::new();
+        panel: u16,
+        send: &SyncSender<Waiting>,
+    ) -> BTreeSet<u32> {
+        let (mut text, mut pages) = (String::new(), BTreeSet::new());
         loop {
-            line.clear();
+            text.clear();
             lines.get_mut().set_limit(MOST_SAID);
-            if !lines.read_line(&mut line).is_ok_and(|n| n > 0) {
-                return;
+            if !lines.read_line(&mut text).is_ok_and(|n| n > 0) {
+                return pages;
             }
-            if line.trim() == "seen" {
-                self.attention.iter().for_each(|attention| attention.seen());
-                continue;
-            }
-            let Some((number, said)) = line.trim().split_once(' ') else { continue };
-            let Ok(number) = number.parse::<u64>() else { continue };
-            let command = said.strip_prefix('@').and_then(|rest| rest.split_once(' ')).map_or(said, |(_, rest)| rest);
-            if command == "stop" {
-                self.stopper.stop();
-                tell_panel(to, &format!("ok {number}"));
-            } else if send.try_send((number, said.to_string())).is_err() {
-                tell_panel(to, &format!("refused {number} {WAITING} commands wait already: say it again"));
+            let (seat, now) = (|page| Seat { panel, page }, Instant::now());
+            match Line::read(text.trim()) {
+                None => {}
+                Some(Line::Seen) => self.attention.iter().for_each(|attention| attention.seen()),
+                Some(Line::Here(page)) => {
+                    pages.insert(page);
+                    self.chair().heard(seat(page), now);
+                }
+                Some(Line::Left(page)) => {
+                    pages.remove(&page);
+                    self.chair().left(seat(page), now);
+                }
+                Some(Line::Command { number, page, words: "stop", .. }) => {
+                    self.stopper.stop(Origin::Page(seat(page)));
+                    tell_panel(to, &format!("ok {number}"));
+                }
+                Some(Line::Command { number, page, given_ns, words }) => {
+                    pages.insert(page);
+                    let mut chair = self.chair();
+                    let seats = chair.says(seat(page), words, now);
+                    let only = seats.is_some();
+                    let may = seats.unwrap_or_else(|| chair.command(seat(page), now));
+                    drop(chair);
+                    let refused = match may {
+                        Err(why) => Some(why),
+                        Ok(()) if only => {
+                            tell_panel(to, &format!("ok {number}"));
+                            None
+                        }
+                        Ok(()) => {
+                            let stamp = given_ns.map_or_else(Stamp::wall, Stamp::Wall);
+                            let said = Waiting { number, stamp, origin: Origin::Page(seat(page)), words: words.into() };
+                            let full = send.try_send(said).is_err();
+                            full.then(|| format!("{WAITING} commands wait already: say it again"))
+                        }
+                    };
+                    refused.iter().for_each(|why| _ = tell_panel(to, &format!("refused {number} {why}")));
+                }
             }
         }
     }
 
     /// Carries out commands in their order.
-    fn answer(&self, to: &Mutex<&UnixStream>, queue: &mpsc::Receiver<(u64, String)>) {
-        for (number, said) in queue {
-            match self.carry_out(&said) {
+    fn answer(&self, to: &Mutex<&UnixStream>, queue: &mpsc::Receiver<Waiting>) {
+        for Waiting { number, stamp, origin, words } in queue {
+            match self.carry_out(&words, stamp, origin) {
                 Ok(Some(cycle)) => tell_panel(to, &format!("ok {number} {cycle}")),
                 Ok(None) => tell_panel(to, &format!("ok {number}")),
                 Err(why) => tell_panel(to, &format!("refused {number} {}", why.trim_start_matches("refused: "))),
@@ -522,21 +583,15 @@ impl Desk {
         }
     }
 
-    /// Executes `@NS COMMAND`: a command and the time at which it was given, by the monotonic clock of this computer.
-    /// Returns the cycle of the log that took it, if one did.
-    fn carry_out(&self, line: &str) -> Result<Option<u64>, String> {
-        let stamped = line.strip_prefix('@').and_then(|rest| rest.split_once(' '));
-        let (stamp, said) = match stamped.and_then(|(ns, said)| Some((Stamp::Wall(ns.parse().ok()?), said))) {
-            Some(both) => both,
-            None => (Stamp::wall(), line),
-        };
+    /// Executes a command that was given at this time. Returns the cycle of the log that took it, if one did.
+    fn carry_out(&self, said: &str, stamp: Stamp, origin: Origin) -> Result<Option<u64>, String> {
         let command = match said {
             "enable" => Command::Enable,
             "arm" => Command::Arm,
             "reset" => return Err(format!("refused: {NO_RESET}")),
             // Clients do not wait for each other.
             "stop" => {
-                self.stopper.stop();
+                self.stopper.stop(origin);
                 return Ok(None);
             }
             _ => match said.strip_prefix("set ") {
@@ -552,7 +607,11 @@ impl Desk {
             Reason::Set(objection) => format!("refused: {}", self.judge.words(&objection)),
             why => format!("refused: {}", why.words()),
         };
-        let ticket = operator().say_at(command, stamp).map_err(refused)?;
+        let ticket = {
+            let mut operator = operator();
+            operator.speaks_for(origin);
+            operator.say_at(command, stamp).map_err(refused)?
+        };
         loop {
             // Other clients can send meanwhile.
             let answer = operator().answer(ticket);

@@ -10,14 +10,16 @@
 
 use crate::args::Hil as Args;
 use crate::terminal::Terminal;
+use runtime::hil::chair::{Chair, Line};
 use runtime::hil::cycle::Gauges;
+use runtime::hil::origin::{Origin, Seat};
 use std::io::{BufRead, BufReader, Write};
 use std::os::unix::process::CommandExt;
 use std::path::Path;
 use std::process::{ChildStdin, ChildStdout, Command, Stdio};
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 /// Interval at which the stage is looked at.
 const LOOK: Duration = Duration::from_millis(50);
@@ -41,6 +43,8 @@ impl Told {
 pub struct Asked {
     /// The command as it is typed at the prompt.
     pub text: String,
+    /// Whose it is.
+    pub seat: Seat,
     number: u64,
     told: Told,
     waiting: Arc<AtomicUsize>,
@@ -66,7 +70,7 @@ impl Drop for Asked {
 /// What is done with the lines of the panel.
 pub struct Hear<'a> {
     /// Stops the rig.
-    pub stop: &'a dyn Fn(),
+    pub stop: &'a dyn Fn(Origin),
     /// Somebody has seen the rig.
     pub seen: &'a dyn Fn(),
     /// Carries out another command.
@@ -125,30 +129,54 @@ impl Beside {
     /// Reads what viewers say, until the panel ends: for a thread of its own.
     pub fn read(self, hear: &Hear) {
         let waiting = Arc::new(AtomicUsize::new(0));
-        let mut terminal = Terminal::new();
-        for line in BufReader::new(self.from).lines() {
+        let (mut terminal, mut chair) = (Terminal::new(), Chair::default());
+        let Beside { told, from } = self;
+        for line in BufReader::new(from).lines() {
             let Ok(line) = line else { break };
-            if line == "seen" {
-                (hear.seen)();
+            if let Some(("link" | "share", rest)) = line.split_once(' ') {
+                let what = if line.starts_with("link") { "panel" } else { "share" };
+                terminal.line(&format!("{what}  {rest}"));
                 continue;
             }
-            let Some((first, rest)) = line.split_once(' ') else { continue };
-            if let "link" | "share" = first {
-                terminal.line(&format!("{}  {rest}", if first == "link" { "panel" } else { first }));
-                continue;
-            }
-            let Ok(number) = first.parse() else { continue };
-            if rest == "stop" {
-                (hear.stop)();
-                self.told.say(&format!("ok {number}"));
-            } else if waiting.fetch_add(1, Ordering::Relaxed) >= WAITING {
-                waiting.fetch_sub(1, Ordering::Relaxed);
-                self.told.say(&format!("refused {number} {WAITING} commands wait already: say it again"));
-            } else {
-                let (text, told, waiting) = (rest.to_string(), self.told.clone(), waiting.clone());
-                (hear.ask)(Asked { text, number, told, waiting });
+            let before = chair.seats();
+            Beside::hear(&told, &line, &mut chair, &waiting, hear);
+            if chair.seats() != before {
+                told.say(&format!("chair {}", chair.seats()));
             }
         }
         terminal.error("the panel has ended; a rig that runs does so on, and this prompt commands it");
+    }
+
+    /// A line about a page.
+    fn hear(told: &Told, line: &str, chair: &mut Chair, waiting: &Arc<AtomicUsize>, hear: &Hear) {
+        let (seat, now) = (|page| Seat { panel: 0, page }, Instant::now());
+        let (number, page, words) = match Line::read(line) {
+            None => return,
+            Some(Line::Seen) => return (hear.seen)(),
+            Some(Line::Here(page)) => {
+                chair.heard(seat(page), now);
+                return;
+            }
+            Some(Line::Left(page)) => return chair.left(seat(page), now),
+            Some(Line::Command { number, page, words, .. }) => (number, seat(page), words),
+        };
+        if words == "stop" {
+            (hear.stop)(Origin::Page(page));
+            return told.say(&format!("ok {number}"));
+        }
+        let seats = chair.says(page, words, now);
+        let only = seats.is_some();
+        match seats.unwrap_or_else(|| chair.command(page, now)) {
+            Err(why) => told.say(&format!("refused {number} {why}")),
+            Ok(()) if only => told.say(&format!("ok {number}")),
+            Ok(()) if waiting.fetch_add(1, Ordering::Relaxed) >= WAITING => {
+                waiting.fetch_sub(1, Ordering::Relaxed);
+                told.say(&format!("refused {number} {WAITING} commands wait already: say it again"));
+            }
+            Ok(()) => {
+                let (text, told, waiting) = (words.to_string(), told.clone(), waiting.clone());
+                (hear.ask)(Asked { text, seat: page, number, told, waiting });
+            }
+        }
     }
 }

@@ -87,7 +87,7 @@ impl Company {
             let (desk, attention) = (self.desk.clone(), self.attention.clone());
             std::thread::spawn(move || {
                 beside.read(&Hear {
-                    stop: &|| desk.stop(),
+                    stop: &|origin| desk.stop(origin),
                     seen: &|| attention.iter().for_each(|attention| attention.seen()),
                     ask: &|asked| desk.ask(asked),
                 });

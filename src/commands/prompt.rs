@@ -15,6 +15,7 @@ use abi::live::{Param, Tunable};
 use grammar::diagnostic::Diagnostic;
 use runtime::hil::live::{Judge, Set};
 use runtime::hil::operator::{Answer, Command, Mark, NO_RESET, Operator, Reason, Stopper};
+use runtime::hil::origin::Origin;
 use runtime::record::log::Sections;
 use std::io::BufRead;
 use std::sync::mpsc::{Receiver, Sender, channel};
@@ -164,7 +165,7 @@ struct Run {
 #[derive(Default)]
 struct Under {
     run: Option<Run>,
-    stopped: bool,
+    stopped: Option<Origin>,
 }
 
 /// Passes the lines of all who speak to the run that is under way.
@@ -191,8 +192,8 @@ impl Desk {
         let stopper = operator.stopper();
         std::thread::spawn(move || carry_out(operator, rehearsal, &typed));
         let mut under = self.under();
-        if std::mem::take(&mut under.stopped) {
-            stopper.stop();
+        if let Some(origin) = under.stopped.take() {
+            stopper.stop(origin);
         }
         under.run = Some(Run { stopper, lines });
     }
@@ -208,11 +209,11 @@ impl Desk {
     }
 
     /// Stops the run; the next one, if it is about to begin.
-    pub fn stop(&self) {
+    pub fn stop(&self, origin: Origin) {
         let mut under = self.under();
         match &under.run {
-            Some(run) => run.stopper.stop(),
-            None => under.stopped = true,
+            Some(run) => run.stopper.stop(origin),
+            None => under.stopped = under.stopped.or(Some(origin)),
         }
     }
 
@@ -244,7 +245,7 @@ impl Desk {
             let under = self.under();
             match (&under.run, line) {
                 (_, "") => {}
-                (Some(run), "stop" | "quit") => run.stopper.stop(),
+                (Some(run), "stop" | "quit") => run.stopper.stop(Origin::Prompt),
                 (Some(run), line) => {
                     let _ = run.lines.send(Line::Typed(line.into()));
                 }
@@ -266,6 +267,10 @@ fn carry_out(mut operator: Operator, mut rehearsal: Option<Rehearsal>, typed: &R
             Line::Typed(text) => text,
             Line::Asked(asked) => &asked.text,
         };
+        operator.speaks_for(match &line {
+            Line::Typed(_) => Origin::Prompt,
+            Line::Asked(asked) => Origin::Page(asked.seat),
+        });
         let mut wait = |command| match operator.wait(command) {
             Answer::Taken(cycle) => Ok(Done { words: String::new(), cycle }),
             Answer::Refused(why) => Err(why.words()),
@@ -289,10 +294,10 @@ fn carry_out(mut operator: Operator, mut rehearsal: Option<Rehearsal>, typed: &R
             (Ok(done), Line::Typed(_)) if done.words.is_empty() => {}
             (Ok(done), Line::Typed(_)) => terminal.line(&format!("  {}", done.words.trim())),
             (Ok(done), Line::Asked(asked)) if done.words.is_empty() => {
-                terminal.line(&format!("  panel: {}", asked.text))
+                terminal.line(&format!("  panel, {}: {}", asked.seat, asked.text))
             }
             (Ok(done), Line::Asked(asked)) => {
-                terminal.line(&format!("  panel: {} ({})", asked.text, done.words.trim()))
+                terminal.line(&format!("  panel, {}: {} ({})", asked.seat, asked.text, done.words.trim()))
             }
             (Err(why), _) => terminal.error(&format!("`{text}` is refused: {why}")),
         }

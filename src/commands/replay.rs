@@ -9,6 +9,7 @@ use crate::{project, quantity};
 use abi::rig::Rig;
 use abi::{Description, Slot};
 use runtime::hil::control::Control;
+use runtime::hil::origin::Origin;
 use runtime::hil::replay::{Replay, Stopped, What};
 use runtime::hil::trace::{self, Cycle, Passed, Shape};
 use runtime::hil::words;
@@ -37,8 +38,14 @@ pub fn replay(args: &Args, terminal: &mut Terminal) -> End {
             Ok(None) => break,
             Err(error) => return fail(terminal, &error.to_string()),
         };
+        exports.hear(&message);
         if let (trace::MARK, Some((due_ns, words))) = (message.kind, trace::read_mark(&message.words)) {
-            marks.push(format!("  mark at {:.3} s: {words}", due_ns as f64 * 1e-9));
+            marks.push(format!("  mark at {:.3} s: {words}{}", due_ns as f64 * 1e-9, exports.by(due_ns, "mark")));
+        }
+        if let (trace::COMMAND, Some((due_ns, name @ ("enable" | "arm" | "stop"), origin))) =
+            (message.kind, trace::read_command(&message.words))
+        {
+            marks.push(format!("  {name} at {:.3} s, by {origin}", due_ns as f64 * 1e-9));
         }
         if stopped.is_none() {
             stopped = replay.message(&message).err();
@@ -121,6 +128,8 @@ struct Exports {
     /// Its cycles, if a table of them is requested.
     cycles: Option<String>,
     candump: Option<String>,
+    /// Commands since the last cycle: when, their names, and who gave them.
+    said: Vec<(u64, &'static str, Origin)>,
 }
 
 impl Exports {
@@ -152,10 +161,29 @@ impl Exports {
             let unit = if series.unit.text.is_empty() { String::new() } else { format!(" [{}]", series.unit) };
             column(format!("{}{unit}", series.label), Holds::Numbers);
         }
+        // At the end, where it moves no other column.
+        column("commands".into(), Holds::Words);
         let names: Vec<&str> = columns.iter().map(|(name, _)| name.as_str()).collect();
         let cycles = (args.csv.is_some() || args.parquet.is_some()).then(|| names.join(",") + "\n");
         let candump = args.candump.as_ref().map(|_| String::new());
-        Exports { rig: rig.clone(), shape: Shape::of(rig, control), columns, cycles, candump }
+        Exports { rig: rig.clone(), shape: Shape::of(rig, control), columns, cycles, candump, said: Vec::new() }
+    }
+
+    /// Notes who gave a command.
+    fn hear(&mut self, message: &Message) {
+        if let (trace::COMMAND, Some(said)) = (message.kind, trace::read_command(&message.words)) {
+            // More than a cycle can have are of cycles that were lost.
+            if self.said.len() == 256 {
+                self.said.remove(0);
+            }
+            self.said.push(said);
+        }
+    }
+
+    /// Who gave this command at this time, as the end of a sentence; empty where the log does not say.
+    fn by(&self, due_ns: u64, name: &str) -> String {
+        let found = self.said.iter().find(|(then_ns, said, _)| (*then_ns, *said) == (due_ns, name));
+        found.map_or(String::new(), |(_, _, origin)| format!(", by {origin}"))
     }
 
     /// Parameters that a cycle changed, in words. `time`: that of the model, in s.
@@ -169,7 +197,7 @@ impl Exports {
         let words = |(slot, si): &(Slot, f64)| {
             let found = model.quantities.iter().find(|quantity| quantity.slot == *slot)?;
             let value = abi::format::quantity(*si, &found.unit, 6);
-            Some(format!("set {} = {value} {when}", found.path))
+            Some(format!("set {} = {value} {when}{}", found.path, self.by(cycle.due_ns, "set")))
         };
         cycle.set.iter().filter_map(words).collect()
     }
@@ -191,6 +219,9 @@ impl Exports {
             for (series, si) in self.rig.record.iter().zip(&cycle.recorded) {
                 let _ = write!(rows, ",{:?}", series.unit.from_si(*si));
             }
+            let own = self.said.iter().filter(|(then_ns, ..)| *then_ns == due_ns);
+            let own: Vec<String> = own.map(|(_, name, origin)| format!("{name} by {origin}")).collect();
+            let _ = write!(rows, ",{}", own.join("; "));
             rows.push('\n');
         }
         if let (Some(candump), trace::FRAMES) = (&mut self.candump, message.kind) {

@@ -530,6 +530,7 @@ impl Subject for WhatIf {
             "cases": setup.labels.iter().map(|label| clean(label)).collect::<Vec<_>>(),
             "signals": signals,
             "canvases": canvases,
+            "phases": setup.sheet.phases_json(),
             "knobs": setup.knobs.iter().map(Knob::json).collect::<Vec<_>>(),
             "from": 0,
             "to": setup.duration,
@@ -559,6 +560,11 @@ impl Subject for WhatIf {
             "set": set.join(" "),
         });
         (inner.state, value)
+    }
+
+    fn numbers(&self) -> (u64, u64) {
+        let inner = self.inner();
+        (inner.hello, inner.state)
     }
 
     fn version(&self) -> u64 {

@@ -37,6 +37,7 @@ impl Panel {
     }
 
     /// `127.0.0.1:PORT`
+    #[allow(dead_code, reason = "not every test that shares this file")]
     pub fn address(&self) -> &str {
         self.origin().trim_start_matches("http://")
     }

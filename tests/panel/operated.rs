@@ -162,6 +162,22 @@ fn a_rig_is_armed_set_and_stopped_from_the_page() {
     let button =
         |text: &str| format!("[...document.querySelectorAll('#kept button')].find(b => b.textContent === '{text}')");
     page.value(&format!("{}.click()", button("keep A")));
+    // Its curves stand still over what goes on, and can be hidden.
+    page.wait("document.getElementById('legend').textContent.endsWith('A')");
+    page.value("document.activeElement.blur()");
+    page.key(" ");
+    let picture = || {
+        page.wait("new Promise(done => requestAnimationFrame(() => setTimeout(() => done(true), 300)))");
+        page.text("document.querySelector('#times .stack canvas').toDataURL()")
+    };
+    let ghosts = || page.value(&format!("{}.click()", button("curves of A")));
+    let with = picture();
+    ghosts();
+    let without = picture();
+    ghosts();
+    assert!(with != without && picture() == with);
+    page.shot("rig-ghost");
+    page.key("Home");
     let back = || {
         typed(&first, "0.47 N·m");
         page.key("Enter");
@@ -209,7 +225,7 @@ fn a_rig_is_armed_set_and_stopped_from_the_page() {
     let log = replayed(&rig.log);
     assert!(log.contains(&format!("set fr.Fs = 0.45 N·m in cycle {cycle}, at")), "{cycle}: {log}");
     let told = rig.told();
-    assert!(told.contains("panel: set fr.Fs = 0.45 N·m, fr.Fc = 0.29 N·m"), "{told}");
+    assert!(told.contains("panel, page 1: set fr.Fs = 0.45 N·m, fr.Fc = 0.29 N·m"), "{told}");
 }
 
 #[test]
@@ -633,6 +649,11 @@ fn the_log_has_each_set_of_many_pages_at_the_cycle_that_is_answered() {
     println!("{} of {} sets were taken, {refused} refused", told.len() - refused, told.len());
     let listed: Vec<&str> = log.lines().filter(|line| line.trim().starts_with("set ")).collect();
     let mut open = wanted.clone();
+    assert!(listed.iter().all(|line| line.contains(", by page ")), "{listed:?}");
+    let table = std::fs::read_to_string(rig.log.with_extension("csv")).unwrap();
+    let by_pages =
+        table.lines().filter(|row| row.rsplit(',').next().is_some_and(|it| it.starts_with("set by page "))).count();
+    assert!(by_pages > 0 && table.lines().next().unwrap().ends_with(",commands"), "{by_pages} of {}", listed.len());
     for line in &listed {
         let at = open.iter().position(|wanted| line.trim().starts_with(wanted.as_str()));
         open.remove(at.unwrap_or_else(|| panic!("`{line}` was not answered: {wanted:?}")));

@@ -22,6 +22,26 @@ fn log(name: &str, seconds: u32) -> PathBuf {
     path
 }
 
+/// The points of the curve that stands under force (signal 2) over speed (signal 1).
+const STEADY: &str = r"new Promise(done => {
+    const s = new WebSocket(`ws://${location.host}/socket`);
+    s.binaryType = 'arraybuffer';
+    s.onopen = () => { s.send('key ' + sessionStorage.getItem('key')); setTimeout(() => s.send('path 0 1,2 all'), 300); };
+    s.onmessage = e => {
+        if (typeof e.data === 'string') return;
+        const d = new DataView(e.data);
+        s.send('ack ' + d.getUint32(0, true));
+        for (let at = 16, block = 0; block < d.getUint32(4, true); block++) {
+            const [curve, count] = [d.getUint32(at + 4, true), d.getUint32(at + 12, true)];
+            const [x, y] = [d.getFloat64(at + 16, true), d.getFloat64(at + 24, true)];
+            at += 32;
+            const points = Array.from({ length: count }, (_, i) => [x + d.getFloat32(at + 8 * i, true), y + d.getFloat32(at + 8 * i + 4, true)]);
+            if (curve !== 2) { s.close(); done(points); }
+            at += 8 * count;
+        }
+    };
+})";
+
 #[test]
 fn a_recording_is_looked_through() {
     let path = log("recording", 4);
@@ -73,6 +93,37 @@ fn a_recording_is_looked_through() {
     println!("body.x differs by {anew} deg from the model anew each second, by {free} from that from arming on");
     assert!(free > anew, "{free} {anew}");
     page.shot("recording-free");
+    // The contact in the plane: its steady curve is that of the text's formula, at the speeds of the recording.
+    page.wait("document.getElementById('legend').textContent.includes('steady curve')");
+    let curve = page.value(STEADY);
+    let points: Vec<(f64, f64)> =
+        curve.as_array().unwrap().iter().filter_map(|point| Some((point[0].as_f64()?, point[1].as_f64()?))).collect();
+    for (rpm, force) in &points {
+        let v: f64 = rpm * std::f64::consts::PI / 30.0;
+        let wanted = v.signum() * (0.28 + 0.14 * (-(v / 0.01).powi(2)).exp()) + 0.018 * v;
+        assert!((force - wanted).abs() < 0.01 * 0.42, "{force} N·m at {v} rad/s, and {wanted} by the formula");
+    }
+    let ends = points.iter().fold((0.0_f64, 0.0_f64), |(low, high), point| (low.min(point.0), high.max(point.0)));
+    assert!(points.len() > 40 && ends.0 < -50.0 && ends.1 > 50.0, "{} points, {ends:?} rpm", points.len());
+    // One press each: over the position, and speed over position.
+    let press = |name: &str| {
+        let all = "[...document.querySelectorAll('#planes .presses button')]";
+        page.value(&format!("{all}.find(b => b.textContent === '{name}').click()"));
+        page.wait(&format!("document.querySelector('#planes .names').textContent.includes('{name}')"));
+        page.wait(
+            "/ to .* at the end/.test(document.querySelector('#planes canvas[role=img]').getAttribute('aria-label'))",
+        );
+        let pressed = page
+            .value(&format!("{all}.filter(b => b.getAttribute('aria-pressed') === 'true').map(b => b.textContent)"));
+        assert_eq!(pressed, json!([name]));
+        page.text("document.querySelector('#planes canvas[role=img]').getAttribute('aria-label')")
+    };
+    assert!(press("fr.F over body.x").starts_with("fr.F, "));
+    page.place("#planes .stack");
+    page.shot("recording-hysteresis");
+    assert!(press("body.v over body.x").starts_with("body.v, "));
+    page.shot("recording-limit-cycle");
+    assert!(press("fr.F over body.v").starts_with("fr.F, "));
     page.value("document.getElementById('free').click()");
     // An event leads to its time.
     page.value("document.querySelector('#happened button').click()");

@@ -180,11 +180,12 @@ fn operated(page: &Page) {
     page.again(&mark, &happened("second bearing"));
 }
 
-fn replayed(log: &Path) {
+fn replayed(log: &Path) -> String {
     let output = fric().arg("replay").arg(log).output().unwrap();
     let told = String::from_utf8_lossy(&output.stdout).into_owned();
     assert!(output.status.success(), "{told}{}", String::from_utf8_lossy(&output.stderr));
     assert!(told.contains("second bearing"), "{told}");
+    told
 }
 
 fn stops_of(parent: u32, name: &str) -> u32 {
@@ -216,13 +217,53 @@ fn a_packed_rig_has_its_panel_beside_it() {
     let mut second = Running::start(&mut second, true);
     let other = browser().page(&second.link);
     sentence(&other, "armed");
+    // One chair for all panels of the rig: the page that operates is one of the first panel.
+    let chair = |page: &Page, text: &str| {
+        page.wait(&format!("document.getElementById('chair').textContent.includes({text:?})"));
+    };
+    chair(&page, "you operate");
+    chair(&other, "page 1 of panel 1 operates");
+    other.wait("document.querySelectorAll('.knob').length === 2");
+    other.again(
+        &|| typed(&other, "fr.Fs", "0.45 N·m"),
+        "document.getElementById('problem').textContent.includes('page 1 of panel 1 operates this rig: take over')",
+    );
+    let press = |page: &Page, text: &str| {
+        let button = format!("[...document.querySelectorAll('#chair button')].find(b => b.textContent === {text:?})");
+        page.wait(&button);
+        page.value(&format!("{button}.click()"));
+    };
+    press(&other, "Take over");
+    chair(&page, "page 1 of panel 2 asks to operate");
+    press(&page, "Refuse");
+    chair(&other, "has refused");
+    // A line of a program needs no chair, and the log knows it from those of pages.
+    let mut say = Command::new(&*FRIC_RIG);
+    let said = say.current_dir(&folder).args(["say", "set fr.Fs = 0.41 N·m", "--dir", "there"]).output().unwrap();
+    assert!(said.status.success(), "{}", String::from_utf8_lossy(&said.stderr));
+    page.wait(&happened("fr.Fs = 0.41 N·m, by fric-rig say"));
+    page.wait(&happened("fr.Fs = 0.5 N·m, by page 1 of panel 1"));
     signal(stops_of(running.child.id(), "panel"), "-KILL");
     sentence(&page, "not connected");
-    other.wait("document.querySelectorAll('.knob').length === 2");
+    // With its panel the page has left the chair.
+    other.wait("document.getElementById('chair').hidden");
+    other.again(&|| typed(&other, "fr.Fs", "0.45 N·m"), &happened("fr.Fs = 0.45 N·m, by page 1 of panel 2"));
+    chair(&other, "you operate");
     other.key("Escape");
     sentence(&other, "ended as asked");
+    other.wait(&happened("stop, by page 1 of panel 2"));
     assert_eq!(running.code(), 0);
-    replayed(&folder.join("slow.friclog"));
+    let told = replayed(&folder.join("slow.friclog"));
+    for line in [
+        "arm at",
+        "by the program",
+        "second bearing, by page 1 of panel 1",
+        "of the model, by fric-rig say",
+        "of the model, by page 1 of panel 2",
+        "stop at",
+    ] {
+        assert!(told.contains(line), "{line}: {told}");
+    }
     drop(other);
     assert_eq!(second.code(), 0);
     // Where no rig runs, there is no panel.

@@ -24,6 +24,9 @@ impl Subject for Counting {
     fn state(&self) -> (u64, Value) {
         (1, json!({}))
     }
+    fn numbers(&self) -> (u64, u64) {
+        (self.hello().0, self.state().0)
+    }
     fn version(&self) -> u64 {
         self.version.load(Ordering::SeqCst)
     }

@@ -13,6 +13,7 @@ use super::counts::Counts;
 use super::live::{Judge, Objection};
 use super::operator::{self, Answer, Commands, Reason};
 pub use super::operator::{Attention, Command, Operator, Watched};
+use super::origin::Origin;
 use super::stage::{Stage, StageGauge};
 use super::trace::{self, Shape};
 use super::watches::Bounds;
@@ -134,7 +135,7 @@ pub struct Hil {
     /// Stops the rig when nobody watches it; none: nobody needs to.
     attention: Option<Arc<Attention>>,
     /// Number of the operator command whose set acts in this cycle.
-    set: Option<u64>,
+    set: Option<(u64, Origin)>,
     due_ns: u64,
     collect_ns: u64,
     k: u64,
@@ -148,6 +149,8 @@ pub struct Hil {
     left: Option<u64>,
     /// The run time of the model is over: a controlled stop follows in the next cycle.
     over: bool,
+    /// The log has the first stop and who gave it.
+    stop_told: bool,
     /// Time at which the drives were told to give up their torque, ns.
     resting_ns: Option<u64>,
     counts: Counts,
@@ -210,6 +213,7 @@ impl Hil {
             overload: 0,
             first_trouble: None,
             over: false,
+            stop_told: false,
             resting_ns: None,
             counts: Counts::default(),
             misuse: false,
@@ -393,8 +397,14 @@ impl Hil {
         let now_ns = self.wires.clock.now_ns();
         self.commands.begin(now_ns);
         // A stop takes precedence: all commands beside it are refused.
-        let stops = self.over || emergency::requested_stop().is_some() | self.commands.takes_stop();
-        if stops {
+        let by_signal = emergency::requested_stop().map(|_| Origin::Signal);
+        let asked = self.commands.takes_stop().or(by_signal).or(self.over.then_some(Origin::Program));
+        let stops = asked.is_some();
+        if let Some(origin) = asked {
+            // Time that is over, and a signal, are there in every cycle until the end.
+            if !std::mem::replace(&mut self.stop_told, true) {
+                self.leave_word(&Command::Stop, origin);
+            }
             self.stop();
         }
         let watched = self.attention.as_ref().map_or(Watched::Yes, |attention| attention.now());
@@ -404,7 +414,10 @@ impl Hil {
         }
         while let Some(said) = self.commands.next(now_ns, false) {
             let has_effect = match said.command {
-                Command::Mark(mark) => self.mark(&mark),
+                Command::Mark(mark) => {
+                    self.leave_word(&said.command, said.origin);
+                    self.mark(&mark)
+                }
                 _ if stops => {
                     self.commands.answer(said.number, Answer::Refused(Reason::Stopping));
                     continue;
@@ -417,6 +430,9 @@ impl Hil {
                 Command::Arm => self.fieldbus.request(Request::Arm),
                 Command::Stop | Command::Set(_) => unreachable!("neither comes this way"),
             };
+            if has_effect && !matches!(said.command, Command::Mark(_)) {
+                self.leave_word(&said.command, said.origin);
+            }
             let answer =
                 if has_effect { Answer::Taken(Some(self.k)) } else { Answer::Refused(Reason::NotNow(self.stage())) };
             self.commands.answer(said.number, answer);
@@ -427,13 +443,27 @@ impl Hil {
         }
         let arms_itself = self.options.arms_itself && self.end.is_none() && self.resting_ns.is_none();
         if arms_itself && self.control.is_some() {
-            match self.fieldbus.step() {
-                Step::AwaitEnable => _ = self.fieldbus.request(Request::Enable),
+            let next = match self.fieldbus.step() {
+                Step::AwaitEnable => Some((Request::Enable, Command::Enable)),
                 Step::AwaitArm if !self.options.checks_only && watched == Watched::Yes => {
-                    _ = self.fieldbus.request(Request::Arm)
+                    Some((Request::Arm, Command::Arm))
                 }
-                _ => {}
+                _ => None,
+            };
+            if let Some((request, command)) = next
+                && self.fieldbus.request(request)
+            {
+                self.leave_word(&command, Origin::Program);
             }
+        }
+    }
+
+    /// Writes into the log, if there is one yet, who gave a command that was carried out.
+    fn leave_word(&mut self, command: &Command, origin: Origin) {
+        if let Some(log) = &mut self.log {
+            self.words.clear();
+            trace::write_command(self.due_ns, command.name(), origin, &mut self.words);
+            log.push(trace::COMMAND, &self.words);
         }
     }
 
@@ -463,7 +493,7 @@ impl Hil {
             }
             None => {
                 self.cycle.set.extend_from_slice(set.values());
-                self.set = Some(said.number);
+                self.set = Some((said.number, said.origin));
             }
         }
     }
@@ -554,10 +584,15 @@ impl Hil {
             causes: &cycle.causes,
             set: &cycle.set,
         });
-        if let Some(number) = self.set.take() {
+        if let Some((number, origin)) = self.set.take() {
             let refused = control.refused_set().map(|status| Answer::Refused(Reason::Set(Objection::Model(status))));
             self.counts.refused_sets += u64::from(refused.is_some());
             self.commands.answer(number, refused.unwrap_or(Answer::Taken(Some(self.k))));
+            if let (None, Some(log)) = (refused, &mut self.log) {
+                self.words.clear();
+                trace::write_command(self.due_ns, "set", origin, &mut self.words);
+                log.push(trace::COMMAND, &self.words);
+            }
         }
         if !is_present(Protection::Recorded) {
             cycle.set.clear();

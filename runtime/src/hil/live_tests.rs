@@ -7,6 +7,7 @@ use super::coupling::look_ahead;
 use super::cycle::{Hil, Options};
 use super::live::{Judge, Objection, Set};
 use super::operator::{Answer, Attention, Command, Mark, Operator, PLACES, Reason, Stamp, Ticket, Watched};
+use super::origin::Origin;
 use super::simulated::{Pace, World};
 use crate::drive::Step;
 use crate::realtime::clock::monotonic_ns;
@@ -160,7 +161,7 @@ fn a_stop_acts_at_once_regardless_of_waiting_commands() {
     stand.reach(Step::Armed);
     let set = stand.set(&[(0, 0.5)]);
     while stand.operator.say(set).is_ok() {}
-    stand.operator.stopper().stop();
+    stand.operator.stopper().stop(Origin::Prompt);
     stand.hil.cycle();
     let cause = stand.hil.control().unwrap().supervisor().cause();
     assert_eq!(cause, Some(crate::safety::Cause::Asked));
@@ -213,7 +214,7 @@ fn a_set_is_accepted_while_the_rig_is_stopped_or_waits() {
     assert_eq!(stand.present()[0], 0.7);
     let mut stand = Stand::new(true);
     stand.reach(Step::Armed);
-    stand.operator.stopper().stop();
+    stand.operator.stopper().stop(Origin::Prompt);
     stand.hil.cycle();
     let stopped = stand.set(&[(0, 0.9)]);
     let stopped = stand.operator.say(stopped).unwrap();

@@ -9,6 +9,8 @@ pub mod watches;
 pub mod followed;
 pub mod control;
 pub mod live;
+pub mod origin;
+pub mod chair;
 pub mod trace;
 pub mod replay;
 #[cfg(all(feature = "hardware", target_os = "linux"))]

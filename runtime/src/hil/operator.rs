@@ -6,13 +6,14 @@
 //! blocks nor allocates, because no more commands can be open than there are places for answers.
 
 use super::live::{Objection, Set};
+use super::origin::Origin;
 use super::stage::Stage;
 use crate::realtime::clock::monotonic_ns;
 use crate::safety::{Protection, is_present};
 use crate::spsc::{Receiver, Sender, queue};
 use std::collections::VecDeque;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
 /// Most commands that can be open at once.
@@ -158,14 +159,22 @@ impl Stamp {
 pub(super) struct Said {
     pub number: u64,
     pub stamp: Stamp,
+    pub origin: Origin,
     pub command: Command,
 }
 
 /// State shared by both sides.
 #[derive(Default)]
 struct Shared {
-    stop: AtomicBool,
+    /// Who has requested a stop first, as a number; 0: nobody.
+    stop: AtomicU64,
     now_ns: AtomicU64,
+}
+
+impl Shared {
+    fn stop(&self, origin: Origin) {
+        let _ = self.stop.compare_exchange(0, origin.number(), Ordering::Relaxed, Ordering::Relaxed);
+    }
 }
 
 /// Stops a rig from any thread, regardless of waiting commands.
@@ -174,8 +183,8 @@ pub struct Stopper(Arc<Shared>);
 
 impl Stopper {
     /// Requests a controlled stop in the next cycle.
-    pub fn stop(&self) {
-        self.0.stop.store(true, Ordering::Relaxed);
+    pub fn stop(&self, origin: Origin) {
+        self.0.stop(origin);
     }
 }
 
@@ -235,6 +244,7 @@ pub struct Operator {
     /// Number of commands without an answer.
     open: usize,
     wall: bool,
+    origin: Origin,
 }
 
 /// Identifies a command whose answer is due.
@@ -245,6 +255,11 @@ impl Operator {
     /// Measures the age of commands by the machine's clock instead of the rig's.
     pub fn by_the_wall(self) -> Operator {
         Operator { wall: true, ..self }
+    }
+
+    /// From now on it passes on the commands of this one.
+    pub fn speaks_for(&mut self, origin: Origin) {
+        self.origin = origin;
     }
 
     /// A handle that stops the rig without this operator.
@@ -272,11 +287,11 @@ impl Operator {
         self.listen();
         let number = self.next;
         if command == Command::Stop {
-            self.shared.stop.store(true, Ordering::Relaxed);
+            self.shared.stop(self.origin);
             self.remember(number, Answer::Taken(None));
         } else if self.commands.is_abandoned() {
             return Err(Reason::Ended);
-        } else if self.open == PLACES || !self.commands.push(Said { number, stamp, command }) {
+        } else if self.open == PLACES || !self.commands.push(Said { number, stamp, origin: self.origin, command }) {
             return Err(Reason::Full);
         } else {
             self.open += 1;
@@ -344,8 +359,16 @@ pub(super) fn commands(period_ns: u64) -> (Operator, Commands) {
     let (answers, answered) = queue(PLACES);
     let shared = Arc::new(Shared::default());
     let known = VecDeque::with_capacity(PLACES);
-    let operator =
-        Operator { commands, answers: answered, shared: shared.clone(), known, next: 0, open: 0, wall: false };
+    let operator = Operator {
+        commands,
+        answers: answered,
+        shared: shared.clone(),
+        known,
+        next: 0,
+        open: 0,
+        wall: false,
+        origin: Origin::Program,
+    };
     (operator, Commands { queue: said, answers, shared, old_ns: OLD_NS.max(2 * period_ns) })
 }
 
@@ -355,9 +378,9 @@ impl Commands {
         self.shared.now_ns.store(now_ns, Ordering::Relaxed);
     }
 
-    /// Whether a stop has been requested since the last call.
-    pub fn takes_stop(&mut self) -> bool {
-        self.shared.stop.swap(false, Ordering::Relaxed)
+    /// Who has requested a stop since the last call, if anybody has.
+    pub fn takes_stop(&mut self) -> Option<Origin> {
+        Origin::of(self.shared.stop.swap(0, Ordering::Relaxed))
     }
 
     /// The next command, if it is a set (`set`) or another command (`!set`); commands that are too old are refused on

@@ -4,6 +4,7 @@
 //! has grown.
 
 use super::control::{Control, Options, Reading, Source};
+use super::origin::Origin;
 use super::watches::Bounds;
 use crate::can::Frame;
 use crate::safety::{Cause, Clamps, DriveCommand};
@@ -15,6 +16,25 @@ pub use crate::record::log::{CYCLE, STATE};
 pub const FRAMES: u32 = 3;
 /// Kind of message: words of an operator.
 pub const MARK: u32 = 5;
+
+/// Kind of message: a command that was carried out, and who gave it. It stands before the cycle that took it, and before
+/// the words of a mark.
+pub const COMMAND: u32 = 6;
+
+/// Commands, by their names, in the order of their numbers in a log.
+const COMMANDS: [&str; 5] = ["enable", "arm", "stop", "set", "mark"];
+
+/// Appends a command that was carried out, by its name, and who gave it.
+pub fn write_command(due_ns: u64, name: &str, origin: Origin, words: &mut Vec<u64>) {
+    let number = COMMANDS.iter().position(|other| *other == name).unwrap_or(COMMANDS.len());
+    words.extend([due_ns, number as u64, origin.number()]);
+}
+
+/// Time in ns and name of a command, and who gave it; none if it is of another version.
+pub fn read_command(words: &[u64]) -> Option<(u64, &'static str, Origin)> {
+    let [due_ns, number, origin] = words else { return None };
+    Some((*due_ns, COMMANDS.get(usize::try_from(*number).ok()?)?, Origin::of(*origin)?))
+}
 
 /// Appends a mark as words: its time in ns, its length in bytes, its bytes.
 pub fn write_mark(due_ns: u64, bytes: &[u8], words: &mut Vec<u64>) {
