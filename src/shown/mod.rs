@@ -3,5 +3,6 @@
 //! In: compiled experiments. Out: a [`Subject`](panel::subject::Subject), whose curves, parameters and verdicts the crate
 //! `panel` brings to browsers, as it does those of rigs.
 
+mod slots;
 mod typed;
 pub mod what_if;

@@ -4,6 +4,7 @@
 //! values and of two runs that were kept. The text is compiled once; a change of a parameter goes into the compiled
 //! instance. Saving the text compiles it again, and parameters that still exist keep their values.
 
+use super::slots::{self, Slot as ModelSlot};
 use super::typed;
 use crate::compile::{self, Loaded, Options, Stopwatch, Tuned, Varying};
 use crate::{project, report, results};
@@ -53,10 +54,14 @@ struct Setup {
     sheet: Sheet,
     duration: f64,
     solver: String,
+    /// Slots for models.
+    models: Vec<ModelSlot>,
+    /// For each slot the model in it.
+    chosen: Vec<String>,
 }
 
 impl Setup {
-    fn new(name: &str, cases: Vec<Varying>) -> Setup {
+    fn new(name: &str, cases: Vec<Varying>, models: Vec<ModelSlot>, chosen: Vec<String>) -> Setup {
         let mut knobs: Vec<Knob> = Vec::new();
         let mut swept = Vec::new();
         for case in &cases {
@@ -99,8 +104,21 @@ impl Setup {
             sheet,
             duration,
             solver,
+            models,
+            chosen,
             cases,
         }
+    }
+
+    /// Whether curves of another setup are of the same signals and cases.
+    fn is_alike(&self, other: &Setup) -> bool {
+        self.name == other.name && self.sheet == other.sheet && self.labels == other.labels
+    }
+
+    /// Its slots whose model is not that of the text, as `--set` takes them.
+    fn changed_models(&self) -> Vec<String> {
+        let both = self.models.iter().zip(&self.chosen);
+        both.filter(|(slot, model)| slot.own != **model).map(|(slot, model)| slot.set(model)).collect()
     }
 
     /// All cases with these values.
@@ -127,6 +145,9 @@ impl Setup {
 /// A run of all cases.
 struct FinishedRun {
     values: Vec<f64>,
+    /// Which parameters these are, and the models of the slots.
+    paths: Vec<String>,
+    chosen: Vec<String>,
     /// For each case and signal its points (t in s, value in its unit).
     curves: Vec<Vec<Vec<(f64, f64)>>>,
     /// For the page.
@@ -191,7 +212,8 @@ impl FinishedRun {
             "words": format!("{} steps, {}", count(steps), duration(took.as_secs_f64(), 3)),
         });
         let duration = cases.iter().map(|case| case.experiment.duration).fold(0.0, f64::max);
-        FinishedRun { values, curves, told, duration }
+        let paths = setup.knobs.iter().map(|knob| knob.path.clone()).collect();
+        FinishedRun { values, paths, chosen: setup.chosen.clone(), curves, told, duration }
     }
 }
 
@@ -202,6 +224,15 @@ struct Layer {
     version: u64,
 }
 
+/// An experiment with models for its slots.
+struct Wanted {
+    name: String,
+    /// Those of the text if none.
+    chosen: Option<Vec<String>>,
+    /// Values of parameters by their paths; those that were changed if none.
+    values: Option<Vec<(String, f64)>>,
+}
+
 struct Inner {
     setup: Arc<Setup>,
     experiments: Vec<String>,
@@ -209,8 +240,8 @@ struct Inner {
     values: Vec<f64>,
     /// Grows with each wish for a run.
     wish: u64,
-    /// The experiment that is wanted, if it is another one.
-    wanted: Option<String>,
+    /// What is wanted, if it must be compiled first.
+    wanted: Option<Wanted>,
     layers: [Layer; LAYERS],
     /// How long the latest runs lasted.
     times: VecDeque<Duration>,
@@ -237,7 +268,7 @@ impl Inner {
     fn is_drawn(&self, layer: usize) -> bool {
         let Some(ran) = &self.layers[layer].ran else { return false };
         let now = self.layers[NOW].ran.as_ref();
-        layer == NOW || now.is_some_and(|now| now.values != ran.values)
+        layer == NOW || now.is_some_and(|now| (&now.values, &now.chosen) != (&ran.values, &ran.chosen))
     }
 }
 
@@ -299,15 +330,34 @@ fn read(file: &Path, named: &[String], colour: bool) -> Result<Text, String> {
     Ok(Text { stamps: stamps_of_all, loaded, experiments })
 }
 
-fn setup(text: &mut Text, name: &str, options: &Options, colour: bool) -> Result<Setup, String> {
-    let cases = compile::adjustable(&mut text.loaded, &crate::disk::Disk, name, options, &mut Vec::new());
+/// `chosen`: for each slot its model, as far as the text has these slots and models; those of the text if none.
+fn setup(
+    text: &mut Text,
+    name: &str,
+    options: &Options,
+    chosen: Option<&[String]>,
+    colour: bool,
+) -> Result<Setup, String> {
+    let models = slots::slots(&text.loaded, name);
+    let own: Vec<String> = models.iter().map(|slot| slot.own.clone()).collect();
+    let fits = |chosen: &&[String]| {
+        chosen.len() == models.len() && models.iter().zip(*chosen).all(|(slot, model)| slot.fits.contains(model))
+    };
+    let chosen = chosen.filter(fits).map_or_else(|| own.clone(), <[String]>::to_vec);
+    let mut options = options.clone();
+    for ((slot, model), own) in models.iter().zip(&chosen).zip(&own) {
+        if model != own {
+            options.changes.set.push(slot.set(model));
+        }
+    }
+    let cases = compile::adjustable(&mut text.loaded, &crate::disk::Disk, name, &options, &mut Vec::new());
     let cases = cases.map_err(|found| report::full(&text.loaded.files.0, &found, colour))?;
     if cases.iter().all(|case| case.plots.is_empty()) {
         return Err(format!(
             "`{name}` has no `plot`, so there is nothing to show: add what to look at, such as `plot x, v`"
         ));
     }
-    Ok(Setup::new(name, cases))
+    Ok(Setup::new(name, cases, models, chosen))
 }
 
 impl WhatIf {
@@ -326,7 +376,7 @@ impl WhatIf {
         let mut text = read(file, named, colour)?;
         watch.stage("compile");
         let name = text.experiments[0].clone();
-        let setup = Arc::new(setup(&mut text, &name, &options, colour)?);
+        let setup = Arc::new(setup(&mut text, &name, &options, None, colour)?);
         let values = setup.own();
         let cases = setup.fitted(&values)?;
         let begun = Instant::now();
@@ -398,16 +448,18 @@ impl WhatIf {
                 match read(&self.file, &self.named, false) {
                     Ok(again) => {
                         text = again;
-                        let name = self.inner().setup.name.clone();
-                        let name = if text.experiments.contains(&name) { name } else { text.experiments[0].clone() };
-                        self.begin(&mut text, &name);
+                        let before = self.inner().setup.clone();
+                        let same = text.experiments.contains(&before.name);
+                        let name = if same { before.name.clone() } else { text.experiments[0].clone() };
+                        let chosen = (same && !before.changed_models().is_empty()).then(|| before.chosen.clone());
+                        self.begin(&mut text, &Wanted { name, chosen, values: None }, true);
                     }
                     Err(why) => self.fail(why),
                 }
                 continue;
             }
-            if let Some(name) = wanted {
-                self.begin(&mut text, &name);
+            if let Some(wanted) = wanted {
+                self.begin(&mut text, &wanted, false);
             } else if wish != done {
                 done = wish;
                 self.run(wish);
@@ -425,12 +477,24 @@ impl WhatIf {
 
     /// Another experiment, or the same one after its text has changed: parameters that it still has keep their values
     /// if someone has changed them.
-    fn begin(&self, text: &mut Text, name: &str) {
-        let setup = match setup(text, name, &self.options, false) {
+    /// `anew`: runs that were kept may be of another text. With other models than those of the text, these run too, as
+    /// what lies behind.
+    fn begin(&self, text: &mut Text, wanted: &Wanted, anew: bool) {
+        let name = wanted.name.as_str();
+        let setup = match setup(text, name, &self.options, wanted.chosen.as_deref(), false) {
             Ok(setup) => Arc::new(setup),
             Err(why) => return self.fail(why),
         };
-        let before = {
+        let of_text = match setup.changed_models().is_empty() {
+            true => setup.clone(),
+            false => match self::setup(text, name, &self.options, None, false) {
+                Ok(own) => Arc::new(own),
+                Err(why) => return self.fail(why),
+            },
+        };
+        let before = if let Some(values) = &wanted.values {
+            values.clone()
+        } else {
             let inner = self.inner();
             let same = inner.setup.name == name;
             let changed =
@@ -449,15 +513,20 @@ impl WhatIf {
                 Err(why) => return self.fail(why),
             },
         };
-        let run = |values: Vec<f64>, cases: &[Case]| {
+        let run = |setup: &Setup, values: Vec<f64>, cases: &[Case]| {
             let begun = Instant::now();
             let results = sweep::run(cases, &|_| Continue::Continue(()));
-            Arc::new(FinishedRun::of(&setup, values, cases, &results, begun.elapsed()))
+            Arc::new(FinishedRun::of(setup, values, cases, &results, begun.elapsed()))
         };
-        let now = run(values.clone(), &cases);
-        let base =
-            if values == own { now.clone() } else { setup.fitted(&own).map_or(now.clone(), |cases| run(own, &cases)) };
+        let now = run(&setup, values.clone(), &cases);
+        // Curves of other signals would stand for these.
+        let own = of_text.own();
+        let base = match of_text.is_alike(&setup) && (values != own || !Arc::ptr_eq(&of_text, &setup)) {
+            true => of_text.fitted(&own).map_or(now.clone(), |cases| run(&of_text, own, &cases)),
+            false => now.clone(),
+        };
         let mut inner = self.inner();
+        let kept = !anew && inner.setup.is_alike(&setup);
         inner.experiments.clone_from(&text.experiments);
         inner.setup = setup;
         inner.values = values;
@@ -465,8 +534,15 @@ impl WhatIf {
         inner.times.clear();
         inner.hello += 1;
         inner.state += 1;
-        for layer in 0..LAYERS {
+        for layer in (0..LAYERS).filter(|layer| !kept || *layer == OWN || *layer == NOW) {
             inner.place(layer, None);
+        }
+        if kept {
+            // A page forgets all curves with the numbers of their signals.
+            for (_, layer) in KEPT {
+                let ran = inner.layers[layer].ran.clone();
+                inner.place(layer, ran);
+            }
         }
         inner.place(OWN, Some(base));
         inner.place(NOW, Some(now));
@@ -531,6 +607,7 @@ impl Subject for WhatIf {
             "signals": signals,
             "canvases": canvases,
             "phases": setup.sheet.phases_json(),
+            "slots": setup.models.iter().map(ModelSlot::json).collect::<Vec<_>>(),
             "knobs": setup.knobs.iter().map(Knob::json).collect::<Vec<_>>(),
             "from": 0,
             "to": setup.duration,
@@ -546,8 +623,9 @@ impl Subject for WhatIf {
         let fastest = inner.times.iter().min().copied().unwrap_or_default();
         let shown = setup.knobs.iter().zip(&inner.values);
         let changed = shown.clone().filter(|(knob, value)| knob.own != **value);
+        let models = setup.changed_models().into_iter().map(|set| format!("--set '{set}'"));
         let set: Vec<String> =
-            changed.map(|(knob, si)| format!("--set '{} = {}'", knob.path, knob.text(*si))).collect();
+            models.chain(changed.map(|(knob, si)| format!("--set '{} = {}'", knob.path, knob.text(*si)))).collect();
         let value = json!({
             "values": shown.clone().map(|(knob, si)| knob.unit.from_si(*si)).collect::<Vec<_>>(),
             "texts": shown.map(|(knob, si)| knob.text(*si)).collect::<Vec<_>>(),
@@ -557,6 +635,7 @@ impl Subject for WhatIf {
             "layers": (0..LAYERS).map(|layer| inner.is_drawn(layer)).collect::<Vec<_>>(),
             "kept": KEPT.map(|(_, layer)| inner.layers[layer].ran.is_some()),
             "to": inner.end(),
+            "models": setup.chosen,
             "set": set.join(" "),
         });
         (inner.state, value)
@@ -664,6 +743,14 @@ impl Subject for WhatIf {
             "go" => {
                 let layer = if rest == "text" { Some(OWN) } else { letter(rest) }.ok_or("go to A, B or text")?;
                 let ran = inner.layers[layer].ran.clone().ok_or_else(|| format!("nothing is kept as {rest}"))?;
+                if ran.chosen != inner.setup.chosen {
+                    let values = ran.paths.iter().cloned().zip(ran.values.iter().copied()).collect();
+                    let name = inner.setup.name.clone();
+                    inner.wanted = Some(Wanted { name, chosen: Some(ran.chosen.clone()), values: Some(values) });
+                    drop(inner);
+                    self.wake.notify_one();
+                    return Ok(String::new());
+                }
                 inner.values.clone_from(&ran.values);
                 inner.problem = None;
                 // A run that is under way is for other values.
@@ -675,9 +762,19 @@ impl Subject for WhatIf {
                 if !inner.experiments.iter().any(|name| name == rest) {
                     return Err(format!("there is no experiment `{}`", clean(rest)));
                 }
-                inner.wanted = Some(rest.into());
+                inner.wanted = Some(Wanted { name: rest.into(), chosen: None, values: None });
             }
-            _ => return Err(format!("`{}` is not known here: set, keep, go or experiment", clean(word))),
+            "slot" => {
+                let found = rest.split_once('=').and_then(|(path, model)| {
+                    let at = inner.setup.models.iter().position(|slot| slot.path == path.trim())?;
+                    inner.setup.models[at].fits.iter().find(|fits| *fits == model.trim()).map(|fits| (at, fits.clone()))
+                });
+                let (at, model) = found.ok_or_else(|| format!("no slot takes this model: `{}`", clean(rest)))?;
+                let (name, mut chosen) = (inner.setup.name.clone(), inner.setup.chosen.clone());
+                chosen[at] = model;
+                inner.wanted = Some(Wanted { name, chosen: Some(chosen), values: None });
+            }
+            _ => return Err(format!("`{}` is not known here: set, keep, go, slot or experiment", clean(word))),
         }
         drop(inner);
         self.wake.notify_one();

@@ -277,3 +277,57 @@ fn newer_columns_join_the_older_ones() {
     );
     assert_eq!(wrong, "");
 }
+
+#[test]
+fn another_model_stands_in_a_slot_by_one_press() {
+    let panel = Panel::open(&[STICK_SLIP, "stick_slip"]);
+    let page = open(&panel);
+    let all = "[...document.querySelectorAll('#models button')]";
+    let press = |model: &str| {
+        page.value(&format!("{all}.find(b => b.textContent === '{model}').click()"));
+        page.wait(&format!(
+            "{all}.filter(b => b.getAttribute('aria-pressed') === 'true').map(b => b.textContent).join() === '{model}'"
+        ));
+        page.wait("[...document.querySelectorAll('#times .plot canvas[role=img]')].every(c => / to .* at the end/.test(c.getAttribute('aria-label')))");
+    };
+    page.wait(&format!("{all}.length > 5"));
+    let models = page.value(&format!("{all}.map(b => b.textContent)"));
+    for model in ["LuGre", "Karnopp", "Dahl"] {
+        assert!(models.as_array().unwrap().iter().any(|one| one == model), "{models}");
+    }
+    let set = || page.text("document.getElementById('set').value");
+    assert_eq!(
+        page.value(&format!("{all}.filter(b => b.getAttribute('aria-pressed') === 'true').length")),
+        serde_json::json!(1)
+    );
+    press("LuGre");
+    let before = summary(&page, 1);
+    press("Karnopp");
+    assert_eq!(set(), "--set 'fr = Karnopp()'");
+    // The run with the model of the text lies behind, in grey, and the numbers are those of `fric run`.
+    page.wait("document.getElementById('legend').textContent.includes('as the text')");
+    assert_ne!(summary(&page, 1), before);
+    let output = fric()
+        .args(["run", STICK_SLIP, "stick_slip", "--json", "--no-error", "--set", "fr = Karnopp()"])
+        .output()
+        .unwrap();
+    let ran: serde_json::Value = serde_json::from_slice(&output.stdout).expect("one object");
+    let verdicts: Vec<bool> =
+        ran["expects"].as_array().unwrap().iter().map(|one| one["holds"].as_bool().unwrap()).collect();
+    let shown = page.value("[...document.querySelectorAll('#judged li')].map(li => li.className === 'yes')");
+    assert_eq!(serde_json::json!(verdicts), shown);
+    page.shot("what-if-other-model");
+    // Kept as A, another model, and back with it.
+    page.value("[...document.querySelectorAll('#kept button')][0].click()");
+    page.wait("[...document.querySelectorAll('#kept button')].some(b => b.textContent === 'to A')");
+    press("Dahl");
+    page.wait("document.getElementById('legend').textContent.includes('A')");
+    page.value("[...document.querySelectorAll('#kept button')].find(b => b.textContent === 'to A').click()");
+    page.wait("document.getElementById('set').value === \"--set 'fr = Karnopp()'\"");
+    page.value("document.getElementById('text').click()");
+    page.wait("document.getElementById('set').value === 'nothing is changed'");
+    page.wait(&format!(
+        "document.querySelectorAll('.plot canvas[role=img]')[1].getAttribute('aria-label') === {before:?}"
+    ));
+    assert_eq!(page.complaints(), [""; 0]);
+}
