@@ -245,18 +245,17 @@ impl Batch {
         self.statuses[lane / 8].0[lane % 8]
     }
 
-    /// As [`advance`](Batch::advance), and appends to `rows` the values of these slots after each step: slot by slot, all
-    /// lanes of one after the other.
+    /// As [`advance`](Batch::advance), and writes to `rows` the values of these slots after each step: slot by slot, all
+    /// lanes of one after the other. Time and count are none of them.
     pub fn advance_and_read(&mut self, pool: &[f64], n: u64, slots: &[Slot], rows: &mut Vec<f64>) -> u64 {
+        rows.resize(n as usize * slots.len() * self.lanes.width, 0.0);
+        if let Some(code) = self.lanes.on_rows.clone().filter(|code| code.inputs.is_empty() && code.outputs == slots) {
+            return self.rows_by_code(&code, pool, &[], rows, n as usize) as u64;
+        }
         for done in 0..n {
             self.advance(pool, 1);
-            for slot in slots {
-                let (line, at) = self.at(*slot, 0);
-                let numbers = self.numbers[line..].iter().flat_map(|line| line.0).skip(at).take(self.lanes.width);
-                rows.extend(numbers.map(f64::from_bits));
-            }
-            let statuses = self.statuses.iter().flat_map(|line| line.0).take(self.lanes.width);
-            if statuses.fold(0, |all, status| all | status) != 0 {
+            self.take(slots, &mut rows[done as usize * slots.len() * self.lanes.width..]);
+            if self.has_failed() {
                 return done + 1;
             }
         }
@@ -285,14 +284,10 @@ impl Batch {
         if let Some(code) = code.filter(|code| code.inputs == inputs && code.outputs == outputs) {
             return self.follow_by_code(&code, pool, given, taken, rows, failed);
         }
-        let to: Vec<usize> = outputs.iter().map(|slot| self.begin_of(*slot)).collect();
         for row in 0..rows {
             self.give(inputs, &given[row * inputs.len() * width..]);
             self.advance(pool, 1);
-            for (k, at) in to.iter().enumerate() {
-                let column = &mut taken[(row * outputs.len() + k) * width..][..width];
-                column.copy_from_slice(&self.flat()[*at..*at + width]);
-            }
+            self.take(outputs, &mut taken[row * outputs.len() * width..]);
             if self.has_failed() {
                 failed(row, self);
             }
@@ -309,33 +304,59 @@ impl Batch {
         rows: usize,
         failed: &mut dyn FnMut(usize, &Batch),
     ) {
-        let (width, needed) = (self.lanes.width, self.lanes.pool_len);
-        let (n, m) = (code.inputs.len() * width, code.outputs.len() * width);
-        assert!(pool.len() >= needed, "pool of {} numbers, {needed} needed", pool.len());
+        let (n, m) = (code.inputs.len() * self.lanes.width, code.outputs.len() * self.lanes.width);
         let mut done = 0;
         while done < rows {
-            self.statuses.fill(Aligned([0; 8]));
-            let (numbers, statuses) = (self.numbers.as_mut_ptr().cast(), self.statuses.as_mut_ptr().cast());
-            let (from, to) = (given[done * n..].as_ptr(), taken[done * m..].as_mut_ptr());
-            // SAFETY: `Batch::new` has allocated the numbers and statuses, and the lengths of pool and rows were checked.
-            let made = unsafe { (code.entry)(numbers, pool.as_ptr(), (rows - done) as u64, statuses, from, to) };
-            done += made as usize;
-            self.give(&code.inputs, &given[(done - 1) * n..]);
+            done += self.rows_by_code(code, pool, &given[done * n..], &mut taken[done * m..], rows - done);
             if self.has_failed() {
                 failed(done - 1, self);
             }
+        }
+    }
+
+    /// Up to so many rows by the code for them, at least one, to the first at which the status of a lane is not 0; returns
+    /// their number.
+    fn rows_by_code(
+        &mut self,
+        code: &FollowLanes,
+        pool: &[f64],
+        given: &[f64],
+        taken: &mut [f64],
+        rows: usize,
+    ) -> usize {
+        let (width, needed) = (self.lanes.width, self.lanes.pool_len);
+        let (n, m) = (code.inputs.len() * width, code.outputs.len() * width);
+        assert!(pool.len() >= needed, "pool of {} numbers, {needed} needed", pool.len());
+        assert!(rows > 0 && given.len() >= rows * n && taken.len() >= rows * m, "{rows} rows");
+        self.statuses.fill(Aligned([0; 8]));
+        let (numbers, statuses) = (self.numbers.as_mut_ptr().cast(), self.statuses.as_mut_ptr().cast());
+        let (from, to) = (given.as_ptr(), taken.as_mut_ptr());
+        // SAFETY: `Batch::new` has allocated the numbers and statuses, and the lengths of pool and rows were checked.
+        let done = unsafe { (code.entry)(numbers, pool.as_ptr(), rows as u64, statuses, from, to) } as usize;
+        if let Some(last) = given.get((done - 1) * n..) {
+            self.give(&code.inputs, last);
         }
         // No step stores these columns: they are inputs, or the same in each row.
         for k in (0..code.outputs.len()).filter(|k| !code.stored[*k]) {
             let at = self.begin_of(code.outputs[k]);
             let column = code.inputs.iter().position(|input| *input == code.outputs[k]);
-            for row in 0..rows {
+            for row in 0..done {
                 let from = match column {
                     Some(column) => &given[row * n + column * width..][..width],
                     None => &self.flat()[at..at + width],
                 };
                 taken[row * m + k * width..][..width].copy_from_slice(from);
             }
+        }
+        done
+    }
+
+    /// Reads the slots of a row of outputs.
+    fn take(&self, outputs: &[Slot], row: &mut [f64]) {
+        let width = self.lanes.width;
+        for (slot, column) in outputs.iter().zip(row.chunks_exact_mut(width)) {
+            let at = self.begin_of(*slot);
+            column.copy_from_slice(&self.flat()[at..at + width]);
         }
     }
 

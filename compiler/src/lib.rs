@@ -190,22 +190,28 @@ fn runs(
     // The description keeps its ranges. The code of a fixed step drops the guards of those that the runs change.
     let mut coded = variant.program.clone();
     coded.description.guards = experiment::vary::in_code(&variant, paths);
-    let functions = functions(&coded, variant.experiment.solver.method);
+    let method = variant.experiment.solver.method;
+    let functions = functions(&coded, method);
     let (code, notes) = code(&functions, &coded.description, interpret);
     let alone = interpret || variant.experiment.bench.is_some();
     let slice = slice.map(|sliced| {
         let guards = coded.description.guards.clone();
         ir::program::Program { description: Description { guards, ..sliced.description }, ..sliced }
     });
-    let many = slice.as_ref().unwrap_or(&coded);
-    let lanes = if alone { None } else { codegen::tiering::lanes(many, variant.experiment.solver.method) };
-    let slice = slice.map(|sliced| step_of(&sliced, variant.experiment.solver.method, interpret));
+    let many = slice.clone().unwrap_or(coded);
+    let slice = slice.map(|sliced| step_of(&sliced, method, interpret));
     let adaptive = variant.adaptive.as_ref().map(|program| {
         let code = codegen::tiering::on_demand(program, Method::Adaptive, interpret);
         Arc::new(Instance::new(Arc::new(program.description.clone()), code, &program.params))
     });
-    let runnable = experiment::vary::Runnable { code, slice, lanes, adaptive, notes };
-    experiment::vary::Varying::new(variant, paths, files, runnable)
+    let runnable = experiment::vary::Runnable { code, slice, adaptive, notes };
+    let varying = experiment::vary::Varying::new(variant, paths, files, runnable);
+    let lanes = |varying: &experiment::vary::Varying| match varying.read_each_step() {
+        Some(read) => codegen::tiering::lanes_on_rows(&many, method, &[], &read),
+        None => codegen::tiering::lanes(&many, method),
+    };
+    let lanes = if alone { None } else { lanes(&varying) };
+    varying.with_lanes(lanes)
 }
 
 /// A model or an experiment as one program, for uses other than a run (C, images, listings).

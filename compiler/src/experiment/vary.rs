@@ -78,8 +78,6 @@ pub struct Runnable {
     /// The step for single runs without the outputs that the experiment does not read, if it has such. The lanes leave out
     /// the same.
     pub slice: Option<Slice>,
-    /// Code for many runs at once in lanes, if available.
-    pub lanes: Option<Lanes>,
     /// The program for adaptive runs of an experiment with fixed steps, if available.
     pub adaptive: Option<Arc<Instance>>,
     /// Notes for the user.
@@ -97,7 +95,7 @@ pub struct PreparedRun {
 impl Varying {
     /// From an experiment as read, and its code.
     pub fn new(variant: Variant, vary: &[String], files: &Files, runnable: Runnable) -> Varying {
-        let Runnable { code, slice, lanes, adaptive, notes } = runnable;
+        let Runnable { code, slice, adaptive, notes } = runnable;
         let Variant { label, system, types, program, mut experiment, places, tuned, .. } = variant;
         let varies = |expr: ExprId| depends(&system, expr, &|var| vary.contains(&var.path));
         let (mut exprs, mut uses) = (Vec::new(), Vec::new());
@@ -176,7 +174,7 @@ impl Varying {
             params: program.params,
             code,
             slice,
-            lanes,
+            lanes: None,
             adaptive,
             varied: vary.to_vec(),
             formulas,
@@ -184,6 +182,20 @@ impl Varying {
             uses,
             expects,
         }
+    }
+
+    /// The same with code for many runs at once in lanes. They leave out the outputs that the slice leaves out.
+    pub fn with_lanes(self, lanes: Option<Lanes>) -> Varying {
+        Varying { lanes, ..self }
+    }
+
+    /// What the measures of a run with a fixed step read after each step, apart from time, ascending; none if they need only
+    /// the last.
+    pub fn read_each_step(&self) -> Option<Vec<Slot>> {
+        let mut measures = self.experiment.expects.iter().flat_map(|expect| &expect.measures);
+        let last = |measure: &Measure| measure.kind == MeasureKind::Final && measure.window == Window::default();
+        let needs_last = self.experiment.solver.method == Method::Adaptive || measures.all(last);
+        (!needs_last).then(|| self.experiment.reads().into_iter().filter(|slot| *slot != Slot::TIME).collect())
     }
 
     /// The description of its program.

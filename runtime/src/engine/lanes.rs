@@ -139,7 +139,6 @@ fn observed<T>(
         let course = &mut all[model].as_mut().expect("there is one").course;
         let pool = pool.get_or_insert_with(|| course.instance().description().pool.clone());
         // Runs that read every step read the same slots, because they have the same plan.
-        rows.clear();
         let seen = all.iter().flatten().find_map(|lane| Some(lane.course.series()?.0.to_vec()));
         let count = (next - total).min(stride);
         let done = match &seen {
