@@ -98,6 +98,7 @@ fn a_recording_is_looked_through() {
     let curve = page.value(STEADY);
     let points: Vec<(f64, f64)> =
         curve.as_array().unwrap().iter().filter_map(|point| Some((point[0].as_f64()?, point[1].as_f64()?))).collect();
+    #[allow(clippy::disallowed_methods, reason = "compared within a tolerance, not to the bit")]
     for (rpm, force) in &points {
         let v: f64 = rpm * std::f64::consts::PI / 30.0;
         let wanted = v.signum() * (0.28 + 0.14 * (-(v / 0.01).powi(2)).exp()) + 0.018 * v;
