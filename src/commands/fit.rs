@@ -368,7 +368,7 @@ pub fn verdicts(loaded: &mut Loaded, name: &str, interpret: bool, terminal: &Ter
     // Of several alternatives the first one is judged.
     let compiled = compiled.into_iter().next().expect("it has been compiled");
     let runs = Runs::new(compiled, None);
-    let settings = Settings { level: args::LEVEL, starts: None, seed: 0 };
+    let settings = Settings::new(args::LEVEL);
     let (answer, steps, _) = match search(&runs, settings) {
         Ok(found) => found,
         Err(trouble) => {

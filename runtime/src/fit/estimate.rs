@@ -4,12 +4,14 @@
 //! them until two end alike. Where a model may have many local minima, they follow a path: runs that are held to the
 //! data, less and less (an observer whose gain falls to zero), or over a growing part of the rows. Output error, weighted
 //! by a noise model: first white noise, then twice an autoregressive model of the residuals, with which residuals and
-//! derivatives are whitened and the search continues. Derivatives are central differences, of a size that the noise
+//! derivatives are whitened and the search continues. Where whitening moves the values further than noise could, the
+//! residuals are no noise, and the estimate remains that of least squares. Derivatives are central differences, of a size that the noise
 //! determines.
 
 use crate::fit::least_squares::{Triangle, singular};
 use crate::fit::noise::Noise;
 use crate::fit::quantiles;
+use crate::fit::sandwich::{Stretch, scatter};
 use crate::fit::trust_region::{End, Ended, Limits, Objective, minimise};
 use crate::fit::unknowns::{Elementary, Scale, Unknown};
 use crate::rng::Chance;
@@ -45,12 +47,34 @@ pub struct Minima {
 }
 
 /// A compared quantity.
-#[derive(Clone, Copy, PartialEq, Debug)]
+#[derive(Clone, PartialEq, Debug)]
 pub struct Item {
     /// Standard deviation of its measurement, if known.
     pub sd: Option<f64>,
-    /// The rows are independent measurements, so that their noise is white.
-    pub independent: bool,
+    /// How its rows follow each other.
+    pub rows: Rows,
+}
+
+/// How rows follow each other, which decides on a model of their noise.
+#[derive(Clone, PartialEq, Debug)]
+pub enum Rows {
+    /// They are independent measurements, so that their noise is white.
+    Independent,
+    /// In equal intervals, but for gaps before these rows.
+    Even(Vec<usize>),
+    /// In different intervals: no filter makes their noise white.
+    Uneven,
+}
+
+/// How values are estimated.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub enum Estimator {
+    /// From whitened residuals, unless these are no noise.
+    Chosen,
+    /// From whitened residuals.
+    Whitened,
+    /// By least squares of the residuals as they are, with a sandwich for their covariance.
+    LeastSquares,
 }
 
 /// What to fit.
@@ -67,12 +91,14 @@ pub struct Question<'a> {
     pub with: Elementary<'a>,
     /// Probability of the intervals.
     pub level: f64,
-    /// Most trial points of each stage.
-    pub trials: u32,
+    /// When a search ends.
+    pub limits: Limits,
     /// Number of starts that are judged, the written one among them.
     pub starts: usize,
     /// Seed of the other starts.
     pub seed: u64,
+    /// How the values are estimated.
+    pub estimator: Estimator,
 }
 
 /// Why a fit gives no answer.
@@ -114,6 +140,12 @@ pub struct Answer {
     pub rough: Vec<usize>,
     /// Noise of each item.
     pub noise: Vec<Noise>,
+    /// The noise by which the residuals are weighted: white, where they are no noise or have no filter.
+    pub weights: Vec<Noise>,
+    /// The residuals are no noise: whitening would move the values further than noise could.
+    pub misfits: bool,
+    /// How often the variance of each value is that of white residuals, where a sandwich gives it; else 1.
+    pub inflation: Vec<f64>,
     /// Root mean square of the residuals of each item.
     pub rms: Vec<f64>,
     /// χ² of the whitened residuals for each degree of freedom. For known standard deviations: 1 if they are right.
@@ -170,12 +202,14 @@ const EQUAL_END: f64 = 1e-3;
 const AT_BOUND: f64 = 1e-6;
 /// The part of the range in which a coordinate at a bound stays.
 const HELD_AT_BOUND: f64 = 1e-7;
+/// Probability with which noise would move the values as far as whitening did, below which residuals are no noise.
+const NO_NOISE: f64 = 1e-3;
 
 /// Finds the values that fit best, from the start.
 ///
 /// # Errors Why there is no answer.
 pub fn fit(question: Question) -> Result<Answer, Trouble> {
-    let Question { unknowns, items, minima, run, with, level, trials, starts, seed } = question;
+    let Question { unknowns, items, minima, run, with, level, limits, starts, seed, estimator } = question;
     let n = unknowns.len();
     assert!(n > 0 && !items.is_empty(), "{n} unknowns, {} items", items.len());
     let scale = Scale { unknowns, with };
@@ -194,7 +228,6 @@ pub fn fit(question: Question) -> Result<Answer, Trouble> {
         runs: 0,
         failures: BTreeMap::new(),
     };
-    let limits = Limits { trials, tolerance: 1e-8 };
     let written = scale.coordinates(&unknowns.iter().map(|unknown| unknown.start).collect::<Vec<f64>>());
     let (judged, rows) = search.judge(items, &spread(&written, &low, &high, starts, seed)).map_err(Trouble::NoStart)?;
     if rows <= n {
@@ -226,7 +259,6 @@ pub fn fit(question: Question) -> Result<Answer, Trouble> {
     let Some(Followed { end, noise, .. }) = best else { return Err(Trouble::NoStart(search.commonest())) };
     let mut x = end.x.clone();
     search.noise = noise;
-    let mut end = Some(end);
     // A model error that a bound causes looks like correlated noise, in which the parameter would leave the bound.
     let (mut from, mut to) = (low.clone(), high.clone());
     for k in 0..n {
@@ -236,19 +268,40 @@ pub fn fit(question: Question) -> Result<Answer, Trouble> {
             None => {}
         }
     }
+    let why = end.why;
+    let mut outcome = Outcome { why, starts, followed, misfits: false };
+    let even = |item: &Item| matches!(item.rows, Rows::Even(_));
+    if estimator == Estimator::LeastSquares || !items.iter().any(even) {
+        outcome.misfits = estimator == Estimator::LeastSquares;
+        return search.conclude(items, &x, level, outcome);
+    }
+    let plain = (x.clone(), search.noise.clone());
     // Twice: a noise model of the residuals, and on from there.
-    for _ in 0..if items.iter().all(|item| item.independent) { 0 } else { 2 } {
+    for _ in 0..2 {
         let residuals = search.residuals(&x).map_err(Trouble::NoStart)?;
         search.weigh(items, &residuals, true);
         let found = minimise(&x, &from, &to, &mut search, limits);
         if found.why == Ended::NoStart {
             break;
         }
-        x.clone_from(&found.x);
-        end = Some(found);
+        x = found.x;
+        outcome.why = found.why;
     }
-    let why = end.expect("there is a first stage").why;
-    search.conclude(items, &x, level, (why, starts, followed))
+    if estimator == Estimator::Chosen && search.misfits(items, (&plain.0, &plain.1), &x) {
+        x = plain.0;
+        search.noise = plain.1;
+        (outcome.why, outcome.misfits) = (why, true);
+    }
+    search.conclude(items, &x, level, outcome)
+}
+
+/// How a search ended, and where those followed did.
+struct Outcome {
+    why: Ended,
+    starts: usize,
+    followed: (Vec<f64>, usize),
+    /// The residuals are no noise.
+    misfits: bool,
 }
 
 /// The paths from the start of this order, each followed to its end. Where a minimum is easily missed, a plain search
@@ -330,21 +383,10 @@ impl Search<'_> {
 
     fn run_all(&mut self, points: &[Vec<f64>]) -> Vec<Result<Residuals, String>> {
         let values: Vec<Vec<f64>> = points.iter().map(|x| self.values(x)).collect();
-        let is_inside = |values: &&Vec<f64>| self.scale.outside(values).is_none();
-        let inside: Vec<Vec<f64>> = values.iter().filter(is_inside).cloned().collect();
-        self.runs += inside.len() as u64;
-        let found = if inside.is_empty() { Vec::new() } else { (self.run)(self.way, &inside) };
-        assert_eq!(found.len(), inside.len(), "a result for each run");
-        let mut found = found.into_iter();
-        let of = |values: &Vec<f64>| match self.scale.outside(values) {
-            Some(_) => Err("an unknown that never lies below another is outside of its range".to_string()),
-            None => found.next().expect("it has been run"),
-        };
-        let all: Vec<Result<Residuals, String>> = values.iter().map(of).collect();
-        // Points that are refused here are no failures of the model.
-        for why in
-            all.iter().zip(&values).filter(|(_, values)| is_inside(values)).filter_map(|(one, _)| one.as_ref().err())
-        {
+        self.runs += values.len() as u64;
+        let all = (self.run)(self.way, &values);
+        assert_eq!(all.len(), values.len(), "a result for each run");
+        for why in all.iter().filter_map(|one| one.as_ref().err()) {
             *self.failures.entry(why.clone()).or_default() += 1;
         }
         all
@@ -469,29 +511,32 @@ impl Search<'_> {
         unreachable!("the rounds end")
     }
 
-    /// Models the noise of each item from its residuals. Returns whether a weight has changed by more than 1 %.
-    fn weigh(&mut self, items: &[Item], residuals: &Residuals, correlated: bool) -> bool {
-        let mut changed = false;
-        for (k, (item, residuals)) in items.iter().zip(residuals).enumerate() {
+    /// A model of the noise of each item from its residuals.
+    fn noise_of(&self, items: &[Item], residuals: &Residuals, correlated: bool) -> Vec<Noise> {
+        let one = |(item, residuals): (&Item, &Vec<f64>)| {
             let mean = mean_square(residuals);
-            let mut noise = match correlated && !item.independent {
-                true => Noise::of(residuals, &self.scale.with),
-                false => Noise::white(mean),
+            let noise = match &item.rows {
+                Rows::Even(gaps) if correlated => Noise::of(residuals, gaps, &self.scale.with),
+                Rows::Even(_) | Rows::Independent | Rows::Uneven => Noise::white(mean),
             };
             // Data that a model fits exactly have no noise to weigh by.
-            noise.variance = item.sd.map_or(mean.max(f64::MIN_POSITIVE), |sd| sd * sd);
-            changed |= (noise.variance / self.noise[k].variance - 1.0).abs() > 0.02;
-            self.noise[k] = noise;
-        }
-        changed
+            Noise { variance: item.sd.map_or(mean.max(f64::MIN_POSITIVE), |sd| sd * sd), ..noise }
+        };
+        items.iter().zip(residuals).map(one).collect()
+    }
+
+    /// Weighs by a model of the noise. Returns whether a weight has changed by more than 2 %.
+    fn weigh(&mut self, items: &[Item], residuals: &Residuals, correlated: bool) -> bool {
+        let now = self.noise_of(items, residuals, correlated);
+        let before = std::mem::replace(&mut self.noise, now);
+        let changes = |(now, before): (&Noise, &Noise)| (now.variance / before.variance - 1.0).abs() > 0.02;
+        self.noise.iter().zip(&before).any(changes)
     }
 
     /// Whitened residuals of all items, one after the other, then what is known beforehand.
     fn white(&self, x: &[f64], residuals: &Residuals) -> Vec<f64> {
-        let mut all: Vec<f64> = Vec::new();
-        for (noise, residuals) in self.noise.iter().zip(residuals) {
-            all.extend(noise.whitened(residuals));
-        }
+        let mut all: Vec<f64> =
+            self.noise.iter().zip(residuals).flat_map(|(noise, residuals)| noise.whitened(residuals)).collect();
         let values = self.values(x);
         let known = self.scale.unknowns.iter().zip(values).filter_map(|(unknown, value)| {
             let (expected, sd) = unknown.known?;
@@ -543,13 +588,59 @@ impl Search<'_> {
         }
     }
 
-    fn conclude(
-        mut self,
-        items: &[Item],
-        x: &[f64],
-        level: f64,
-        (why, starts, (ends, agreed)): (Ended, usize, (Vec<f64>, usize)),
-    ) -> Result<Answer, Trouble> {
+    /// Whether the residuals of least squares, at `plain` with these weights, are no noise: whitening has moved the values
+    /// to `x`, where the sum of squares is larger by more than noise explains. If the model is right, both estimate the
+    /// same values, and the rise is at most a sum of squares of normal variables whose variances are those of least
+    /// squares (Hausman, Econometrica 46 (1978)); its distribution is taken as that of a multiple of χ² with the same
+    /// mean and variance (Satterthwaite 1946).
+    fn misfits(&mut self, items: &[Item], (plain, weights): (&[f64], &[Noise]), x: &[f64]) -> bool {
+        let n = plain.len();
+        let whitened = std::mem::replace(&mut self.noise, weights.to_vec());
+        let mut at = |x: &[f64]| {
+            let residuals = self.residuals(x).ok()?;
+            self.weigh(items, &residuals, false);
+            Some(residuals)
+        };
+        let found = at(x).and_then(|moved| Some((moved, at(plain)?)));
+        let is_larger = found.is_some_and(|(moved, residuals)| {
+            let (white, moved) = (self.white(plain, &residuals), self.white(x, &moved));
+            let square = |rows: &[f64]| rows.iter().map(|r| r * r).sum::<f64>();
+            let degrees = (white.len() as f64 - n as f64).max(1.0);
+            let rise = (square(&moved) - square(&white)) / (square(&white) / degrees);
+            let Some(columns) = self.columns(plain, 1.0).filter(|_| rise > 0.0) else { return false };
+            // What is at a bound does not scatter.
+            let free = (0..n).filter(|k| self.at_bound(plain, *k).is_none());
+            let columns: Vec<Vec<f64>> = free.map(|k| columns[k].clone()).collect();
+            if columns.is_empty() {
+                return false;
+            }
+            let triangle = reduced(&columns, &white);
+            let of_r = |k: usize| (0..columns.len()).map(|row| triangle.r[row * columns.len() + k]).collect();
+            let parts = singular((0..columns.len()).map(of_r).collect(), &triangle.qf);
+            let scattered = scatter(&columns, &white, &self.stretches(items, &residuals));
+            let (ratios, stretch) = (scattered.ratios(&parts), scattered.stretch());
+            let known = (1..).find(|known| known * known >= ratios.len()).unwrap_or(1);
+            let trace: f64 = (0..known).map(|k| ratios[k * known + k]).sum::<f64>() * degrees / square(&white);
+            let squared: f64 = square(&ratios) * (degrees / square(&white)) * (degrees / square(&white));
+            let (scale, degrees) = (squared / trace, trace * trace / squared);
+            quantiles::chi_square_tail(rise / (scale * stretch * stretch), degrees, &self.scale.with) < NO_NOISE
+        });
+        self.noise = whitened;
+        is_larger
+    }
+
+    /// The rows of each item among the whitened residuals of all.
+    fn stretches(&self, items: &[Item], residuals: &Residuals) -> Vec<Stretch> {
+        let mut begin = 0;
+        let one = |((item, noise), rows): ((&Item, &Noise), &Vec<f64>)| {
+            let end = begin + noise.kept(rows.len()).count();
+            Stretch { rows: std::mem::replace(&mut begin, end)..end, independent: item.rows == Rows::Independent }
+        };
+        items.iter().zip(&self.noise).zip(residuals).map(one).collect()
+    }
+
+    fn conclude(mut self, items: &[Item], x: &[f64], level: f64, outcome: Outcome) -> Result<Answer, Trouble> {
+        let Outcome { why, starts, followed: (ends, agreed), misfits } = outcome;
         let n = x.len();
         let residuals = self.residuals(x).map_err(Trouble::NoStart)?;
         let failed = |this: &Self| Trouble::NoStart(this.commonest());
@@ -579,10 +670,30 @@ impl Search<'_> {
         let variance = if items.iter().any(|item| item.sd.is_some()) { 1.0 } else { chi_square };
         let of_r = |k: usize| (0..n).map(|row| triangle.r[row * n + k]).collect::<Vec<f64>>();
         let parts = singular((0..n).map(of_r).collect(), &triangle.qf);
-        let covariance = |i: usize, j: usize| -> f64 {
+        let model = |i: usize, j: usize| -> f64 {
             let each = parts.values.iter().zip(&parts.vectors);
             each.map(|(s, v)| variance * (v[i] / s) * (v[j] / s)).sum()
         };
+        // Where no model makes the noise white, the scatter of the gradient takes its place.
+        let uneven = items.iter().any(|item| item.rows == Rows::Uneven);
+        let scattered = (misfits || uneven).then(|| scatter(&columns, &white, &self.stretches(items, &residuals)));
+        let small_sample = white.len() as f64 / degrees;
+        // Of the combinations of singular vectors i and j.
+        let ratios: Option<Vec<f64>> = scattered.as_ref().map(|scattered| {
+            let of = |at: usize| scattered.form(&parts.vectors[at / n], &parts.vectors[at % n]) * small_sample;
+            (0..n * n).map(of).collect()
+        });
+        let covariance = |i: usize, j: usize| -> f64 {
+            let Some(ratios) = &ratios else { return model(i, j) };
+            let part = |a: usize, k: usize| parts.vectors[a][k] / (parts.values[a] * parts.values[a]);
+            (0..n * n).map(|at| part(at / n, i) * ratios[at] * part(at % n, j)).sum()
+        };
+        let along = |a: usize| match &ratios {
+            Some(ratios) => ratios[a * n + a].sqrt() / (parts.values[a] * parts.values[a]),
+            None => variance.sqrt() / parts.values[a],
+        };
+        let inflation = |k: usize| if ratios.is_some() { (covariance(k, k) / model(k, k)).max(1.0) } else { 1.0 };
+        let inflation = (0..n).map(inflation).collect();
         let values = self.values(x);
         let unknowns = self.scale.unknowns;
         // From coordinates to values, of which each depends on few coordinates.
@@ -594,7 +705,8 @@ impl Search<'_> {
             slopes[i].iter().map(of).sum()
         };
         let sd: Vec<f64> = (0..n).map(|k| covariance(k, k).sqrt()).collect();
-        let t = quantiles::student(level, degrees, &self.scale.with);
+        let stretch = scattered.as_ref().map_or(1.0, |scattered| scattered.stretch());
+        let t = quantiles::student(level, degrees, &self.scale.with) * stretch;
         // In the scale of each unknown on its own.
         let interval = |k: usize| {
             let unknown = &unknowns[k];
@@ -607,8 +719,8 @@ impl Search<'_> {
         // A scale by logarithms of negative values reverses their order.
         let is_rising = |k: usize| unknowns[k].above.is_some() || unknowns[k].slope(values[k]) > 0.0;
         let at_bound = |k: usize| self.at_bound(x, k).map(|edge| (edge == Edge::High) == is_rising(k));
-        let undetermined = parts.values.iter().zip(&parts.vectors).filter_map(|(s, v)| {
-            let sensitivity = s / variance.sqrt();
+        let undetermined = parts.vectors.iter().enumerate().filter_map(|(a, v)| {
+            let sensitivity = 1.0 / along(a);
             // In the scale of each unknown on its own, too.
             let moved = |k: usize| slopes[k].iter().map(|(a, slope)| slope * v[*a]).sum::<f64>();
             let own: Vec<f64> = (0..n).map(|k| moved(k) / unknowns[k].slope(values[k])).collect();
@@ -616,7 +728,11 @@ impl Search<'_> {
             let direction = own.iter().map(|c| c / length).collect();
             (sensitivity < LEAST_SENSITIVITY).then_some(Combination { sensitivity, direction })
         });
+        // What is left is described by a model of its correlation, also where the values do not come from it.
+        let noise = if misfits { self.noise_of(items, &residuals, true) } else { self.noise.clone() };
         Ok(Answer {
+            misfits,
+            inflation,
             intervals: (0..n).map(interval).collect(),
             correlation: (0..n * n).map(|at| correlation(at / n, at % n)).collect(),
             at_bound: (0..n).map(at_bound).collect(),
@@ -633,7 +749,8 @@ impl Search<'_> {
             followed: ends.len(),
             agreed,
             ends,
-            noise: self.noise,
+            noise,
+            weights: self.noise,
             runs: self.runs,
             failures: self.failures,
         })
@@ -691,6 +808,7 @@ mod tests {
     }
 
     const TRUE: [f64; 3] = [2.0, 0.05, -0.3];
+    const LIMITS: Limits = Limits { trials: 100, tolerance: 1e-8 };
     const DRIVEN: Minima = Minima { held: false, driven: true, regimes: false };
 
     fn decay(p: &[f64], t: f64) -> f64 {
@@ -725,9 +843,10 @@ mod tests {
             run: &mut run,
             with: PLATFORM,
             level: 0.95,
-            trials: 100,
+            limits: LIMITS,
             starts: 1,
             seed: 0,
+            estimator: Estimator::Chosen,
         })
     }
 
@@ -744,8 +863,8 @@ mod tests {
                         decay(&TRUE, f64::from(t)) + 0.01 * past
                     })
                     .collect();
-                let answer =
-                    fitted(&data, &unknowns(), &[Item { sd: None, independent: false }]).expect("it has an answer");
+                let answer = fitted(&data, &unknowns(), &[Item { sd: None, rows: Rows::Even(Vec::new()) }])
+                    .expect("it has an answer");
                 for k in 0..3 {
                     let (low, high) = answer.intervals[k];
                     held[k] += i32::from((low..=high).contains(&TRUE[k]));
@@ -761,14 +880,14 @@ mod tests {
     fn a_known_standard_deviation_counts_and_knowledge_beforehand_narrows() {
         let mut chance = Chance(7);
         let data: Vec<f64> = (0..200).map(|t| decay(&TRUE, f64::from(t)) + 0.01 * normal(&mut chance)).collect();
-        let free = fitted(&data, &unknowns(), &[Item { sd: None, independent: false }]).unwrap();
-        let doubled = fitted(&data, &unknowns(), &[Item { sd: Some(0.02), independent: false }]).unwrap();
+        let free = fitted(&data, &unknowns(), &[Item { sd: None, rows: Rows::Even(Vec::new()) }]).unwrap();
+        let doubled = fitted(&data, &unknowns(), &[Item { sd: Some(0.02), rows: Rows::Even(Vec::new()) }]).unwrap();
         let estimated = free.chi_square.sqrt() * free.rms[0];
         assert!((doubled.sd[1] / free.sd[1] - 0.02 / estimated).abs() < 0.1, "{doubled:?} {free:?}");
         assert!((doubled.chi_square - 0.25).abs() < 0.08, "{doubled:?}");
         let mut known = unknowns();
         known[1].known = Some((TRUE[1], 1e-6));
-        let narrowed = fitted(&data, &known, &[Item { sd: Some(0.01), independent: false }]).unwrap();
+        let narrowed = fitted(&data, &known, &[Item { sd: Some(0.01), rows: Rows::Even(Vec::new()) }]).unwrap();
         assert!((narrowed.sd[1] - 1e-6).abs() < 1e-8 && narrowed.sd[0] < free.sd[0], "{narrowed:?} {free:?}");
     }
 
@@ -792,7 +911,7 @@ mod tests {
                         |p: &Vec<f64>| Ok(vec![(0..200).map(|t| wave(p[0], p[1], t) - data[t as usize]).collect()]);
                     points.iter().map(one).collect::<Vec<Result<Residuals, String>>>()
                 };
-                let items = &[Item { sd: None, independent: false }];
+                let items = &[Item { sd: None, rows: Rows::Even(Vec::new()) }];
                 let (unknowns, run) = (&unknowns, &mut run);
                 let question = Question {
                     unknowns,
@@ -801,9 +920,10 @@ mod tests {
                     run,
                     with: PLATFORM,
                     level: 0.95,
-                    trials: 100,
+                    limits: LIMITS,
                     starts,
                     seed,
+                    estimator: Estimator::Chosen,
                 };
                 let answer = fit(question).unwrap();
                 let found = (answer.values[0] - omega).abs() < 0.02;
@@ -853,7 +973,7 @@ mod tests {
                 };
                 points.iter().map(one).collect::<Vec<Result<Residuals, String>>>()
             };
-            let items = &[Item { sd: None, independent: false }];
+            let items = &[Item { sd: None, rows: Rows::Even(Vec::new()) }];
             for (k, path) in
                 [vec![], PARTS.map(Way::First).to_vec(), POLES.map(Way::Held).to_vec()].into_iter().enumerate()
             {
@@ -874,8 +994,7 @@ mod tests {
                     failures: BTreeMap::new(),
                 };
                 let begin = search.along(items, &scale.coordinates(&[start]), path).expect("it runs");
-                let end =
-                    search.follow(items, begin, Limits { trials: 100, tolerance: 1e-8 }).unwrap().expect("it runs");
+                let end = search.follow(items, begin, LIMITS).unwrap().expect("it runs");
                 found[k] += u32::from((scale.values(&end.end.x)[0] / omega - 1.0).abs() < 0.01);
             }
         }
@@ -906,7 +1025,7 @@ mod tests {
             let data: Vec<f64> = (0..100).map(|t| decay(&TRUE, f64::from(t)) + 0.01 * normal(&mut chance)).collect();
             let mut bounded = unknowns();
             bounded[2] = Unknown { low: -1.0, high: TRUE[2] - 0.1, start: -0.8, known: None, above: None };
-            let answer = fitted(&data, &bounded, &[Item { sd: None, independent: false }]).unwrap();
+            let answer = fitted(&data, &bounded, &[Item { sd: None, rows: Rows::Even(Vec::new()) }]).unwrap();
             assert_eq!(answer.at_bound[2], Some(true), "seed {seed}: {answer:?}");
         }
     }
@@ -915,7 +1034,7 @@ mod tests {
     fn trouble_is_named() {
         let data = vec![1.0; 3];
         assert_eq!(
-            fitted(&data, &unknowns(), &[Item { sd: None, independent: false }]),
+            fitted(&data, &unknowns(), &[Item { sd: None, rows: Rows::Even(Vec::new()) }]),
             Err(Trouble::TooFewRows(3, 3))
         );
         let mut run = |_: Way, points: &[Vec<f64>]| {
@@ -923,7 +1042,7 @@ mod tests {
             points.iter().map(one).collect::<Vec<Result<Residuals, String>>>()
         };
         let with = PLATFORM;
-        let item = [Item { sd: None, independent: false }];
+        let item = [Item { sd: None, rows: Rows::Even(Vec::new()) }];
         let unknowns = unknowns();
         let question = Question {
             unknowns: &unknowns[..2],
@@ -932,9 +1051,10 @@ mod tests {
             run: &mut run,
             with,
             level: 0.95,
-            trials: 100,
+            limits: LIMITS,
             starts: 1,
             seed: 0,
+            estimator: Estimator::Chosen,
         };
         assert_eq!(fit(question), Err(Trouble::NoInfluence(vec![1])));
         let mut never =
@@ -946,9 +1066,10 @@ mod tests {
             run: &mut never,
             with,
             level: 0.95,
-            trials: 100,
+            limits: LIMITS,
             starts: 1,
             seed: 0,
+            estimator: Estimator::Chosen,
         };
         assert_eq!(fit(question), Err(Trouble::NoStart("too many steps".into())));
     }
@@ -969,14 +1090,15 @@ mod tests {
             };
             let answer = fit(Question {
                 unknowns: &[unknown],
-                items: &[Item { sd: None, independent: false }],
+                items: &[Item { sd: None, rows: Rows::Even(Vec::new()) }],
                 minima: Minima { regimes: true, ..Minima::default() },
                 run: &mut run,
                 with: PLATFORM,
                 level: 0.95,
-                trials: 100,
+                limits: LIMITS,
                 starts: 16,
                 seed,
+                estimator: Estimator::Chosen,
             });
             let answer = answer.unwrap_or_else(|trouble| panic!("seed {seed}: {trouble:?}"));
             assert!(
@@ -993,9 +1115,133 @@ mod tests {
         let noise: Vec<f64> = (0..100).map(|_| 0.01 * normal(&mut chance)).collect();
         let unknown = Unknown { low: 0.1, high: 10.0, start: 0.7, known: None, above: None };
         let residuals = |p: &[f64]| noise.iter().map(|e| p[0] * p[1] - 1.0 - e).collect();
-        let answer = answered(&[unknown; 2], &[Item { sd: None, independent: false }], &residuals).unwrap();
+        let answer = answered(&[unknown; 2], &[Item { sd: None, rows: Rows::Even(Vec::new()) }], &residuals).unwrap();
         assert!((answer.values[0] * answer.values[1] - 1.0).abs() < 0.01, "{answer:?}");
         let [open] = &answer.undetermined[..] else { panic!("{answer:?}") };
         assert!((open.direction[0] + open.direction[1]).abs() < 1e-3, "{open:?}");
+    }
+
+    /// A parameter of each of some functions of the row; residuals are what is left of the data.
+    fn linear(functions: &[Vec<f64>], data: &[f64], p: &[f64]) -> Vec<f64> {
+        (0..data.len()).map(|row| functions.iter().zip(p).map(|(f, p)| f[row] * p).sum::<f64>() - data[row]).collect()
+    }
+
+    /// A question about one compared quantity.
+    fn asked(unknowns: &[Unknown], rows: Rows, starts: usize, residuals: &dyn Fn(&[f64]) -> Vec<f64>) -> Answer {
+        let mut run = |_: Way, points: &[Vec<f64>]| {
+            points.iter().map(|p| Ok(vec![residuals(p)])).collect::<Vec<Result<Residuals, String>>>()
+        };
+        fit(Question {
+            unknowns,
+            items: &[Item { sd: None, rows }],
+            minima: DRIVEN,
+            run: &mut run,
+            with: PLATFORM,
+            level: 0.95,
+            limits: LIMITS,
+            starts,
+            seed: 0,
+            estimator: Estimator::Chosen,
+        })
+        .expect("it has an answer")
+    }
+
+    const PLAIN: Unknown = Unknown { low: -10.0, high: 10.0, start: 1.0, known: None, above: None };
+
+    /// The model lacks a slow course, and has a fast one that the data lack. Whitening removes what is slow, so that the
+    /// fast one would decide, and the sum of squares would be far from its least. Least squares keeps the gain of the slow
+    /// one. Where only correlated noise is lacking, whitening is kept. With the test of the rise left out, no seed of the
+    /// first kind has the gain of least squares.
+    #[test]
+    fn residuals_that_are_no_noise_are_not_whitened() {
+        let mut kept = 0;
+        for seed in 0..100 {
+            let (mut chance, mut past) = (Chance(seed), 0.0);
+            let phase = chance.between(0.0, 6.0);
+            let slow: Vec<f64> = (0..1000).map(|t| (0.05 * f64::from(t)).sin()).collect();
+            let other: Vec<f64> = (0..1000).map(|t| (0.083 * f64::from(t) + phase).sin()).collect();
+            let both: Vec<f64> = slow.iter().map(|slow| slow + 0.1 * normal(&mut chance)).collect();
+            let noise: Vec<f64> = (0..1000)
+                .map(|_| {
+                    past = 0.9 * past + 0.01 * normal(&mut chance);
+                    past
+                })
+                .collect();
+            let wrong: Vec<f64> = (0..1000).map(|t| slow[t] + other[t] + noise[t]).collect();
+            let right: Vec<f64> = both.iter().zip(&noise).map(|(both, noise)| both + noise).collect();
+            let functions = [both.clone()];
+            let answer = asked(&[PLAIN], Rows::Even(vec![]), 1, &|p| linear(&functions, &wrong, p));
+            let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
+            let expected = dot(&both, &wrong) / dot(&both, &both);
+            let found = answer.values[0];
+            assert!(answer.misfits && (found - expected).abs() < 1e-5, "seed {seed}: {found}, not {expected}");
+            let answer = asked(&[PLAIN], Rows::Even(vec![]), 1, &|p| linear(&functions, &right, p));
+            kept += u32::from(!answer.misfits && answer.weights[0].order() > 0);
+        }
+        assert!(kept >= 97, "{kept} of 100");
+    }
+
+    /// Rows in uneven intervals have no filter, and their intervals hold the truth by the scatter of the gradient. With the
+    /// covariance of white noise they hold it in half of the cases.
+    #[test]
+    fn intervals_of_uneven_rows_hold_the_truth() {
+        let mut held = [0; 2];
+        for seed in 0..200 {
+            let (mut chance, mut past) = (Chance(seed), 0.0);
+            let slow: Vec<f64> = (0..800).map(|t| (0.02 * f64::from(t)).sin()).collect();
+            let data: Vec<f64> = (0..800)
+                .map(|t| {
+                    past = 0.8 * past + 0.1 * normal(&mut chance);
+                    2.0 * slow[t] - 0.5 + past
+                })
+                .collect();
+            let functions = [slow, vec![1.0; 800]];
+            let answer = asked(&[PLAIN; 2], Rows::Uneven, 1, &|p| linear(&functions, &data, p));
+            assert!(answer.noise[0].order() == 0 && !answer.misfits);
+            for (held, ((low, high), truth)) in held.iter_mut().zip(answer.intervals.iter().zip([2.0, -0.5])) {
+                *held += u32::from((*low..=*high).contains(&truth));
+            }
+        }
+        // Binomial: 190 ± 3 of 200, less what the few windows cost.
+        assert!(held.iter().all(|held| (176..=200).contains(held)), "of 200: {held:?}");
+    }
+
+    /// Two unknowns, one of which never lies below the other, with ranges of any kind: from every start the search ends
+    /// where a fine grid has its least, also where this is at a bound, or where both are the same. With the distance
+    /// itself as the coordinate, some searches stop where the upper one meets the end of its range.
+    #[test]
+    fn searches_beside_a_bound_of_another_end_in_the_minimum() {
+        for seed in 0..40 {
+            let mut chance = Chance(seed);
+            let functions: Vec<Vec<f64>> =
+                (0..2).map(|_| (0..30).map(|_| chance.between(-1.0, 1.0)).collect()).collect();
+            let truth = [chance.between(0.5, 4.0), chance.between(0.5, 6.0)];
+            let data: Vec<f64> = linear(&functions, &[0.0; 30], &truth);
+            let data: Vec<f64> = data.iter().map(|y| y + 0.1 * normal(&mut chance)).collect();
+            let of = |low: f64, above| Unknown { low, above, ..PLAIN };
+            let mut unknowns = [of(chance.between(0.05, 0.3), None), of(chance.between(0.05, 1.0), Some(0))];
+            unknowns.iter_mut().for_each(|one| one.high = chance.between(1.5, 8.0));
+            let square = |p: &[f64]| linear(&functions, &data, p).iter().map(|r| r * r).sum::<f64>();
+            let scale = Scale { unknowns: &unknowns, with: PLATFORM };
+            let (low, high) = scale.bounds();
+            let at = |i: usize, j: usize| {
+                let x = |k: usize, part: usize| low[k] + (high[k] - low[k]) * part as f64 / 400.0;
+                square(&scale.values(&[x(0, i), x(1, j)]))
+            };
+            let least = (0..=400).flat_map(|i| (0..=400).map(move |j| (i, j)));
+            let least = least.map(|(i, j)| at(i, j)).fold(f64::INFINITY, f64::min);
+            for start in 0..10 {
+                let x: Vec<f64> = (0..2).map(|k| chance.between(low[k], high[k])).collect();
+                let values = Scale { unknowns: &unknowns, with: PLATFORM }.values(&x);
+                unknowns.iter_mut().zip(values).for_each(|(one, value)| one.start = value);
+                let rows = Rows::Independent;
+                let answer = asked(&unknowns, rows, 1, &|p| linear(&functions, &data, p));
+                let found = square(&answer.values);
+                assert!(
+                    found <= 1.001 * least + 1e-9,
+                    "seed {seed}, start {start}: {found}, not {least}: {unknowns:?}"
+                );
+            }
+        }
     }
 }

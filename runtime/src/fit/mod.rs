@@ -9,13 +9,14 @@ pub mod quantiles;
 pub mod least_squares;
 pub mod trust_region;
 pub mod noise;
+pub mod sandwich;
 pub mod estimate;
 pub mod statistics;
 pub mod ranking;
 pub mod information;
 pub mod cma_es;
 
-pub use estimate::{Answer, Combination, Item, Minima, Question, Residuals, Trouble, Way, fit};
+pub use estimate::{Answer, Combination, Estimator, Item, Minima, Question, Residuals, Rows, Trouble, Way, fit};
 pub use noise::Noise;
-pub use trust_region::Ended;
+pub use trust_region::{Ended, Limits};
 pub use unknowns::{Elementary, Unknown};

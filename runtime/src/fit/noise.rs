@@ -1,9 +1,10 @@
 //! A model of the noise of a measurement: autoregressive, its order by an information criterion.
 //!
-//! In: the residuals of a fit, row by row. Out: an AR(p) model, p ≤ 8, and the filter that makes residuals and their
-//! derivatives white. Sources: Burg's method (Kay, Modern Spectral Estimation, sec. 7.4); BIC (Schwarz 1978).
+//! In: the residuals of a fit, row by row, and the gaps between rows. Out: an AR(p) model, p ≤ 8, and the filter that makes
+//! residuals and their derivatives white; it begins anew after each gap. Sources: Burg's method (Kay, Modern Spectral Estimation, sec. 7.4); BIC (Schwarz 1978).
 
 use crate::fit::unknowns::Elementary;
+use std::ops::Range;
 
 /// Highest order.
 pub const MOST_ORDER: usize = 8;
@@ -17,30 +18,34 @@ pub struct Noise {
     pub variance: f64,
     /// Variance of e as a fraction of that of the residuals.
     pub innovation: f64,
+    /// Rows before which there is a gap, ascending: no row after it follows from those before it.
+    pub gaps: Vec<usize>,
 }
 
 impl Noise {
     /// White noise of this variance.
     pub fn white(variance: f64) -> Noise {
-        Noise { coefficients: Vec::new(), variance, innovation: 1.0 }
+        Noise { coefficients: Vec::new(), variance, innovation: 1.0, gaps: Vec::new() }
     }
 
-    /// The model of these residuals.
-    pub fn of(residuals: &[f64], with: &Elementary) -> Noise {
+    /// The model of these residuals, with gaps before these rows.
+    pub fn of(residuals: &[f64], gaps: &[usize], with: &Elementary) -> Noise {
         let n = residuals.len();
         let variance = residuals.iter().map(|r| r * r).sum::<f64>() / n.max(1) as f64;
-        let mut noise = Noise::white(variance);
+        let mut noise = Noise { gaps: gaps.to_vec(), ..Noise::white(variance) };
         if variance <= 0.0 || variance.is_nan() {
             return noise;
         }
         let most = MOST_ORDER.min(n / 10);
+        let stretches = noise.stretches(n);
         let (mut forward, mut backward) = (residuals.to_vec(), residuals.to_vec());
         let (mut a, mut power): (Vec<f64>, f64) = (Vec::new(), 1.0);
         let criterion = |power: f64, order: usize| n as f64 * (with.log)(power) + order as f64 * (with.log)(n as f64);
         let mut least = criterion(power, 0);
         for order in 1..=most {
             let (mut product, mut square) = (0.0, 0.0);
-            for t in order..n {
+            let after = |rows: &Range<usize>| rows.start + order..rows.end;
+            for t in stretches.iter().flat_map(after) {
                 product += forward[t] * backward[t - 1];
                 square += forward[t] * forward[t] + backward[t - 1] * backward[t - 1];
             }
@@ -48,7 +53,7 @@ impl Noise {
                 break;
             }
             let k = 2.0 * product / square;
-            for t in (order..n).rev() {
+            for t in stretches.iter().flat_map(|rows| after(rows).rev()) {
                 let (f, b) = (forward[t], backward[t - 1]);
                 (forward[t], backward[t]) = (f - k * b, b - k * f);
             }
@@ -66,21 +71,32 @@ impl Noise {
         noise
     }
 
+    /// The rows between gaps, of so many.
+    fn stretches(&self, rows: usize) -> Vec<Range<usize>> {
+        let mut begin = 0;
+        let ends = self.gaps.iter().copied().take_while(|gap| *gap < rows).chain([rows]);
+        ends.map(|end| std::mem::replace(&mut begin, end)..end).collect()
+    }
+
     /// Number of rows that the filter uses up.
     pub fn order(&self) -> usize {
         self.coefficients.len()
     }
 
-    /// Filters a series and divides it by the standard deviation of e. The first p rows, which have no past, are left
-    /// out.
+    /// The rows that whitening leaves, of so many: without the first p of each stretch, which have no past.
+    pub fn kept(&self, rows: usize) -> impl Iterator<Item = usize> + use<> {
+        let p = self.order();
+        self.stretches(rows).into_iter().flat_map(move |rows| rows.start + p..rows.end)
+    }
+
+    /// Filters a series and divides it by the standard deviation of e. Of its rows, those [kept](Noise::kept).
     pub fn whitened(&self, series: &[f64]) -> Vec<f64> {
         let scale = 1.0 / (self.variance * self.innovation).sqrt();
-        let p = self.order();
         let one = |t: usize| {
             let predicted: f64 = self.coefficients.iter().enumerate().map(|(k, a)| a * series[t - 1 - k]).sum();
             scale * (series[t] - predicted)
         };
-        (p..series.len()).map(one).collect()
+        self.kept(series.len()).map(one).collect()
     }
 }
 
@@ -104,7 +120,7 @@ mod tests {
                 let past: f64 = a.iter().enumerate().filter(|(k, _)| t > *k).map(|(k, a)| a * series[t - 1 - k]).sum();
                 series.push(past + normal(&mut chance));
             }
-            let noise = Noise::of(&series, &PLATFORM);
+            let noise = Noise::of(&series, &[], &PLATFORM);
             assert_eq!(noise.order(), a.len(), "{a:?}: {noise:?}");
             for (found, expected) in noise.coefficients.iter().zip(&a) {
                 assert!((found - expected).abs() < 0.03, "{a:?}: {noise:?}");
@@ -113,14 +129,46 @@ mod tests {
             let variance = white.iter().map(|e| e * e).sum::<f64>() / white.len() as f64;
             assert!((variance - 1.0).abs() < 1e-3, "{a:?}: variance {variance}");
             assert!((noise.variance * noise.innovation - 1.0).abs() < 0.04, "{a:?}: {noise:?}");
-            assert!(Noise::of(&white, &PLATFORM).order() == 0, "{a:?}: white after the filter");
+            assert!(Noise::of(&white, &[], &PLATFORM).order() == 0, "{a:?}: white after the filter");
         }
     }
 
     #[test]
     fn nothing_and_constants_are_white() {
         for series in [vec![], vec![0.0; 50], vec![1.0; 3]] {
-            assert_eq!(Noise::of(&series, &PLATFORM).order(), 0, "{series:?}");
+            assert_eq!(Noise::of(&series, &[], &PLATFORM).order(), 0, "{series:?}");
+        }
+    }
+
+    /// Stretches of a process that do not follow each other: its coefficient is found, and no row is predicted across a
+    /// gap. With the gaps forgotten, the jumps at them count as noise.
+    #[test]
+    fn the_filter_begins_anew_after_a_gap() {
+        for seed in 0..20 {
+            let mut chance = Chance(seed);
+            let (mut series, mut gaps) = (Vec::new(), Vec::new());
+            while series.len() < 4000 {
+                gaps.push(series.len());
+                let mut past = normal(&mut chance) / f64::sqrt(1.0 - 0.81);
+                for _ in 0..20 + chance.below(40) {
+                    past = 0.9 * past + normal(&mut chance);
+                    series.push(past);
+                }
+            }
+            let [noise, forgotten] = [&gaps[1..], &[]].map(|gaps| Noise::of(&series, gaps, &PLATFORM));
+            let mean = |noise: &Noise| {
+                let white = noise.whitened(&series);
+                noise.variance * noise.innovation * white.iter().map(|e| e * e).sum::<f64>() / white.len() as f64
+            };
+            assert!(noise.order() == 1 && (noise.coefficients[0] - 0.9).abs() < 0.03, "seed {seed}: {noise:?}");
+            assert!(
+                (mean(&noise) - 1.0).abs() < 0.1 && mean(&forgotten) > 1.1 * mean(&noise),
+                "seed {seed}: {}",
+                mean(&forgotten)
+            );
+            let kept: Vec<usize> = noise.kept(series.len()).collect();
+            assert_eq!(kept.len(), series.len() - gaps.len(), "seed {seed}");
+            assert!(gaps.iter().all(|gap| !kept.contains(gap)), "seed {seed}");
         }
     }
 }

@@ -34,19 +34,23 @@ pub struct Dependence {
 /// The column that explains most of the variance of residuals, if it is significant: the rows are divided into classes by
 /// the value of the column, and under independence the sum of squares between the classes is distributed as χ².
 ///
-/// `white`: the whitened residuals, of the last rows. Source: Davidson, MacKinnon, Econometric Theory and Methods,
+/// `white`: the whitened residuals; `kept`: their rows. Source: Davidson, MacKinnon, Econometric Theory and Methods,
 /// sec. 5.4 (the Wald test of dummies).
-pub fn dependence(residuals: &[f64], white: &[f64], columns: &[&[f64]], with: &Elementary) -> Option<Dependence> {
-    let first = residuals.len() - white.len();
+pub fn dependence(
+    residuals: &[f64],
+    (kept, white): (&[usize], &[f64]),
+    columns: &[&[f64]],
+    with: &Elementary,
+) -> Option<Dependence> {
+    let mut place = vec![None; residuals.len()];
+    kept.iter().enumerate().for_each(|(at, row)| place[*row] = Some(at));
     let one = |(k, column): (usize, &&[f64])| {
         let classes = classes(column);
         if classes.len() < 2 {
             return None;
         }
-        let of_white: Vec<Vec<usize>> = classes
-            .iter()
-            .map(|class| class.iter().filter(|row| **row >= first).map(|row| row - first).collect())
-            .collect();
+        let of_white: Vec<Vec<usize>> =
+            classes.iter().map(|class| class.iter().filter_map(|row| place[*row]).collect()).collect();
         let (between, all) = between(white, &of_white);
         let n = white.len() as f64;
         let degrees = classes.len() as f64 - 1.0;
@@ -69,6 +73,39 @@ pub fn dependence(residuals: &[f64], white: &[f64], columns: &[&[f64]], with: &E
     };
     let found = columns.iter().enumerate().filter_map(one);
     found.max_by(|a, b| a.share.total_cmp(&b.share))
+}
+
+/// Rows of a class whose residuals are this many times as large as those of all others, by their medians.
+const LARGER: f64 = 3.0;
+
+/// The column and the class of its values in which more than half of the squared error lies, where the rows of the class
+/// are no few outliers: the model lacks something there that has no sign. Its `share` is that of the squared error.
+pub fn concentration(residuals: &[f64], columns: &[&[f64]]) -> Option<Dependence> {
+    let all: f64 = residuals.iter().map(|r| r * r).sum();
+    let median = |rows: &mut dyn Iterator<Item = usize>| {
+        let mut sizes: Vec<f64> = rows.map(|row| residuals[row].abs()).collect();
+        sizes.sort_by(f64::total_cmp);
+        sizes.get(sizes.len() / 2).copied().unwrap_or(0.0)
+    };
+    let of = |(k, column): (usize, &&[f64])| {
+        let classes = classes(column);
+        let one = |(at, class): (usize, &Vec<usize>)| {
+            let share = class.iter().map(|row| residuals[*row] * residuals[*row]).sum::<f64>() / all;
+            let others = classes.iter().enumerate().filter(|(other, _)| *other != at).flat_map(|(_, class)| class);
+            let is_larger = || median(&mut class.iter().copied()) > LARGER * median(&mut others.copied());
+            let found = share > MOST && 2 * class.len() < residuals.len() && is_larger();
+            // Rows with the value that most of the class have are meant.
+            let middle = column[class[class.len() / 2]];
+            let equal = class.iter().filter(|row| column[**row] == middle).count();
+            let (class, edge) = match 2 * equal > class.len() {
+                true => ((middle, middle), (false, false)),
+                false => ((column[class[0]], column[*class.last()?]), (at == 0, at + 1 == classes.len())),
+            };
+            found.then_some(Dependence { column: k, share, class, edge })
+        };
+        classes.iter().enumerate().filter_map(one).next()
+    };
+    columns.iter().enumerate().filter_map(of).max_by(|a, b| a.share.total_cmp(&b.share))
 }
 
 /// P(χ² > x) with this number of degrees of freedom.
@@ -125,9 +162,8 @@ pub struct Outliers {
 }
 
 /// Rows that hold much of the error; none if there are no such. The standard deviation is that of the median, which
-/// outliers do not move. `white`: the whitened residuals, of the last rows.
-pub fn outliers(residuals: &[f64], white: &[f64]) -> Option<Outliers> {
-    let first = residuals.len() - white.len();
+/// outliers do not move. `white`: the whitened residuals; `kept`: their rows.
+pub fn outliers(residuals: &[f64], (kept, white): (&[usize], &[f64])) -> Option<Outliers> {
     let robust = |rows: &[f64]| {
         let mut sizes: Vec<f64> = rows.iter().map(|r| r.abs()).collect();
         sizes.sort_by(f64::total_cmp);
@@ -136,8 +172,8 @@ pub fn outliers(residuals: &[f64], white: &[f64]) -> Option<Outliers> {
     };
     let (sd, unfiltered) = (robust(white), robust(residuals));
     // Whitening spreads an outlier over the rows after it.
-    let is_far = |k: &usize| white[*k].abs() > FAR * sd && residuals[k + first].abs() > 0.5 * FAR * unfiltered;
-    let rows: Vec<usize> = (0..white.len()).filter(|k| sd > 0.0 && is_far(k)).map(|k| k + first).collect();
+    let is_far = |k: &usize| white[*k].abs() > FAR * sd && residuals[kept[*k]].abs() > 0.5 * FAR * unfiltered;
+    let rows: Vec<usize> = (0..white.len()).filter(|k| sd > 0.0 && is_far(k)).map(|k| kept[k]).collect();
     let n = residuals.len();
     let all: f64 = residuals.iter().map(|r| r * r).sum();
     let tenths = (0..TENTHS).map(|k| k * n / TENTHS..(k + 1) * n / TENTHS);
@@ -169,6 +205,24 @@ pub fn gaps(times: &[f64]) -> Vec<usize> {
     (0..intervals.len()).filter(|k| intervals[*k] > 1.5 * median).map(|k| k + 1).collect()
 }
 
+/// Intervals that scatter by more than this part of their median are uneven, as are rows of which more than this part
+/// follow a gap.
+const EVEN: f64 = 0.1;
+
+/// The gaps between rows of a recording; none if its rows are not in equal intervals otherwise. Rows that are left out
+/// between two others make a gap.
+pub fn intervals(times: &[f64]) -> Option<Vec<usize>> {
+    let gaps = gaps(times);
+    let all: Vec<f64> = times.windows(2).map(|pair| pair[1] - pair[0]).collect();
+    let mut is_gap = vec![false; times.len()];
+    gaps.iter().for_each(|row| is_gap[*row] = true);
+    let between: Vec<f64> = (0..all.len()).filter(|k| !is_gap[k + 1]).map(|k| all[k]).collect();
+    let n = between.len().max(1) as f64;
+    let mean = between.iter().sum::<f64>() / n;
+    let square = between.iter().map(|interval| (interval - mean) * (interval - mean)).sum::<f64>() / n;
+    (square <= EVEN * EVEN * mean * mean && gaps.len() as f64 <= EVEN * times.len() as f64).then_some(gaps)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -190,11 +244,13 @@ mod tests {
             let columns: Vec<Vec<f64>> = (0..3).map(|_| (0..n).map(|_| chance.between(-1.0, 1.0)).collect()).collect();
             let noise: Vec<f64> = (0..n).map(|_| normal(&mut chance)).collect();
             let slices: Vec<&[f64]> = columns.iter().map(Vec::as_slice).collect();
-            false_alarms += usize::from(dependence(&noise, &noise, &slices, &PLATFORM).is_some());
+            let all: Vec<usize> = (0..n).collect();
+            false_alarms += usize::from(dependence(&noise, (&all, &noise), &slices, &PLATFORM).is_some());
             let which = seed as usize % 3;
             let strong: Vec<f64> =
                 (0..n).map(|k| noise[k] + if columns[which][k] < -0.8 { 3.0 } else { 0.0 }).collect();
-            let found = dependence(&strong, &strong, &slices, &PLATFORM).unwrap_or_else(|| panic!("seed {seed}: none"));
+            let found =
+                dependence(&strong, (&all, &strong), &slices, &PLATFORM).unwrap_or_else(|| panic!("seed {seed}: none"));
             assert_eq!((found.column, found.edge), (which, (true, false)), "seed {seed}: {found:?}");
             // Variance of the step: 9 · 0.1 · 0.9 = 0.81, of 1.81. A class with rows of both sides explains less.
             assert!((0.2..0.57).contains(&found.share) && found.class.1 < -0.7, "seed {seed}: {found:?}");
@@ -202,10 +258,31 @@ mod tests {
         assert!(false_alarms <= 2, "{false_alarms} of 300");
     }
 
+    /// Rows at rest, a quarter of them, in which the error is large and of either sign: they are named. A few wild rows
+    /// and plain noise are not.
+    #[test]
+    fn rows_that_hold_the_error_are_found_by_a_column() {
+        for seed in 0..200 {
+            let mut chance = Chance(seed);
+            let column: Vec<f64> =
+                (0..1000).map(|k| if k % 4 == 0 { 0.0 } else { chance.between(-1.0, 1.0) }).collect();
+            let noise: Vec<f64> = (0..1000).map(|_| normal(&mut chance)).collect();
+            let rest: Vec<f64> = (0..1000).map(|k| if k % 4 == 0 { 20.0 } else { 1.0 } * noise[k]).collect();
+            let found = concentration(&rest, &[&column]).unwrap_or_else(|| panic!("seed {seed}: none"));
+            let (low, high) = found.class;
+            assert!(low > -0.03 && high < 0.03 && found.share > 0.9, "seed {seed}: {found:?}");
+            assert_eq!(concentration(&noise, &[&column]), None, "seed {seed}");
+            let wild: Vec<f64> = (0..1000).map(|k| if k < 3 { 100.0 } else { noise[k] }).collect();
+            let rising: Vec<f64> = (0..1000).map(f64::from).collect();
+            assert_eq!(concentration(&wild, &[&rising]), None, "seed {seed}");
+        }
+    }
+
     #[test]
     fn columns_that_do_not_vary_divide_nothing() {
         let rows: Vec<f64> = (0..200).map(f64::from).collect();
-        assert_eq!(dependence(&rows, &rows, &[&[1.0; 200]], &PLATFORM), None);
+        let all: Vec<usize> = (0..200).collect();
+        assert_eq!(dependence(&rows, (&all, &rows), &[&[1.0; 200]], &PLATFORM), None);
         let steps: Vec<f64> = (0..200).map(|k| f64::from(k / 150)).collect();
         let all = classes(&steps);
         assert_eq!(all.iter().map(Vec::len).collect::<Vec<_>>(), [150, 50]);
@@ -217,11 +294,12 @@ mod tests {
         for seed in 0..100 {
             let mut chance = Chance(seed);
             let mut rows: Vec<f64> = (0..2000).map(|_| normal(&mut chance)).collect();
-            assert_eq!(outliers(&rows, &rows[3..]), None, "seed {seed}");
+            let kept: Vec<usize> = (3..rows.len()).collect();
+            assert_eq!(outliers(&rows, (&kept, &rows[3..])), None, "seed {seed}");
             let at = 10 + chance.below(1900) as usize;
             let length = 1 + chance.below(60) as usize;
             rows[at..at + length].iter_mut().for_each(|r| *r = 40.0 * if chance.fraction() < 0.5 { -1.0 } else { 1.0 });
-            let found = outliers(&rows, &rows[3..]).unwrap_or_else(|| panic!("seed {seed}: none"));
+            let found = outliers(&rows, (&kept, &rows[3..])).unwrap_or_else(|| panic!("seed {seed}: none"));
             assert_eq!(found.rows, (at..at + length).collect::<Vec<_>>(), "seed {seed}");
         }
     }
@@ -240,5 +318,31 @@ mod tests {
             let even: Vec<f64> = (0..1000).map(|k| 0.1 * k as f64).collect();
             assert!(gaps(&even).is_empty());
         }
+    }
+
+    /// A clock with little jitter and a few gaps is even; one whose intervals differ by a half, or with many gaps, is not.
+    #[test]
+    fn even_rows_are_told_from_uneven_ones() {
+        for seed in 0..100 {
+            let mut chance = Chance(seed);
+            let mut clock = |jitter: f64, gap: u64| {
+                let (mut t, mut times, mut gaps) = (0.0, Vec::new(), Vec::new());
+                for row in 0..500 {
+                    let is_gap = row > 0 && chance.below(gap) == 0;
+                    t += 1e-3 * (1.0 + chance.between(-jitter, jitter)) * if is_gap { 20.0 } else { 1.0 };
+                    gaps.extend(is_gap.then_some(row));
+                    times.push(t);
+                }
+                (times, gaps)
+            };
+            let (times, gaps) = clock(0.1, 100);
+            assert_eq!(intervals(&times), Some(gaps), "seed {seed}");
+            assert_eq!(intervals(&clock(0.4, 100).0), None, "seed {seed}");
+            assert_eq!(intervals(&clock(0.0, 5).0), None, "seed {seed}");
+        }
+        assert_eq!(
+            (intervals(&[]), intervals(&[1.0]), intervals(&[1.0, 2.0])),
+            (Some(vec![]), Some(vec![]), Some(vec![]))
+        );
     }
 }

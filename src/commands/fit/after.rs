@@ -6,9 +6,10 @@
 
 use super::search::{Found, Part, Runs, Settings, estimate};
 use crate::compile::ElementaryFunction;
+use abi::unit::Unit;
 use runtime::fit::ranking;
 use runtime::fit::statistics::{self, Dependence, Outliers};
-use runtime::fit::{Answer, Elementary, Item, Noise, Residuals, Trouble, Unknown, Way};
+use runtime::fit::{Answer, Elementary, Item, Limits, Noise, Residuals, Trouble, Unknown, Way};
 
 /// Components of a combination that count, as a fraction of the largest.
 pub const NAMED: f64 = 0.2;
@@ -23,6 +24,8 @@ const BETTER: f64 = 0.5;
 /// Fewest rows for each unknown of a piece.
 const LEAST_ROWS: usize = 10;
 
+/// When the search in a piece ends: whether it drifts needs few digits, and what a piece does not determine wanders on.
+const OF_PIECE: Limits = Limits { trials: 15, tolerance: 1e-4 };
 /// A piece determines a value whose standard deviation is below this, in the scale of the search.
 const CLEAR: f64 = 0.05;
 /// Probability of a false drift, over all unknowns together.
@@ -34,18 +37,30 @@ pub type Piece = Vec<Option<(f64, f64)>>;
 /// Runs a model with values of all unknowns.
 type Whole<'a> = dyn FnMut(&[Vec<f64>]) -> Vec<Result<Residuals, String>> + 'a;
 
-/// Runs with some of the unknowns, the others as in `base`.
+/// Runs with some of the unknowns, the others as in `base`, which bound those that they must not cross.
 fn restricted(
     runs: &Runs,
     base: &[f64],
     free: &[usize],
     settings: Settings,
-    run: &mut Whole,
+    (items, run): (&[Item], &mut Whole),
 ) -> Result<Answer, Trouble> {
-    let (all, items): (Vec<Unknown>, Vec<Item>) = runs.asked(base);
+    let all = runs.asked(base);
     let place = |k: usize| free.iter().position(|other| *other == k);
-    let unknowns: Vec<Unknown> =
-        free.iter().map(|k| Unknown { above: all[*k].above.and_then(place), ..all[*k] }).collect();
+    let one = |k: &usize| {
+        let mut unknown = all[*k];
+        if let Some(below) = unknown.above.filter(|below| place(*below).is_none()) {
+            unknown.low = unknown.low.max(base[below]);
+        }
+        let fixed = (0..all.len()).filter(|other| all[*other].above == Some(*k) && place(*other).is_none());
+        unknown.high = fixed.fold(unknown.high, |high, other| high.min(base[other]));
+        unknown.above = unknown.above.and_then(place);
+        let has_room = unknown.low < unknown.high;
+        unknown.start = unknown.start.min(unknown.high).max(unknown.low);
+        has_room.then_some(unknown)
+    };
+    let unknowns: Option<Vec<Unknown>> = free.iter().map(one).collect();
+    let unknowns = unknowns.ok_or_else(|| Trouble::NoStart("the others leave no room".into()))?;
     let mut whole = |_: Way, points: &[Vec<f64>]| {
         let expanded = points.iter().map(|point| {
             let mut values = base.to_vec();
@@ -56,7 +71,7 @@ fn restricted(
         });
         run(&expanded.collect::<Vec<_>>())
     };
-    estimate(runs, &unknowns, &items, Settings { starts: Some(1), ..settings }, &mut whole)
+    estimate(runs, &unknowns, items, Settings { starts: Some(1), ..settings }, &mut whole)
 }
 
 /// Whether an unknown is part of a combination that the data do not determine.
@@ -75,23 +90,28 @@ pub fn pieces(runs: &Runs, (answer, steps, _): &Found, settings: Settings, count
     if count < 2 || rows < LEAST_ROWS * n * count || steady {
         return Vec::new();
     }
-    let (all, _) = runs.asked(&answer.values);
+    let all = runs.asked(&answer.values);
+    let settings = Settings { limits: OF_PIECE, ..settings.like(answer) };
     let one = |piece: usize| {
         let mut free: Vec<usize> = (0..n).filter(|k| !runs.unknowns[*k].initial).collect();
-        let mut run = |points: &[Vec<f64>]| {
-            runs.residuals_at(points, steps, &|part: &Part| {
-                let rows = part.instants.len();
-                (piece * rows / count..(piece + 1) * rows / count).collect()
-            })
+        let rows = |part: &Part| {
+            let rows = part.instants.len();
+            (piece * rows / count..(piece + 1) * rows / count).collect()
         };
+        let items = runs.compared(&rows);
+        let mut run = |points: &[Vec<f64>]| runs.residuals_at(points, steps, &rows);
         while !free.is_empty() {
-            match restricted(runs, &answer.values, &free, settings, &mut run) {
+            match restricted(runs, &answer.values, &free, settings, (&items, &mut run)) {
                 Ok(found) => {
                     let mut values: Piece = vec![None; n];
                     for (at, k) in free.iter().enumerate() {
-                        // Where the misfit is not quadratic, a standard deviation means little.
+                        // Where the misfit is not quadratic, a standard deviation means little. Without a distance
+                        // from the one above it, a value is that of both.
                         let own = found.sd[at] / all[*k].slope(found.values[at]).abs();
-                        let known = own < CLEAR && found.at_bound[at].is_none() && !is_open(&found, at);
+                        let is_vague = |at: usize| found.at_bound[at].is_some() || is_open(&found, at);
+                        let above = free.iter().enumerate().filter(|(_, other)| all[**other].above == Some(*k));
+                        let alone = above.into_iter().all(|(other, _)| !is_vague(other));
+                        let known = own < CLEAR && !is_vague(at) && alone;
                         values[*k] = known.then_some((found.values[at], found.sd[at]));
                     }
                     return values;
@@ -153,11 +173,11 @@ pub struct Profile {
     pub ends: (Option<f64>, Option<f64>),
 }
 
-/// −2 log-likelihood, but for a constant.
-pub fn misfit(runs: &Runs, answer: &Answer, values: &[f64]) -> f64 {
+/// −2 log-likelihood under a model of the noise, but for a constant.
+pub fn misfit(runs: &Runs, (noise, residuals): (&[Noise], &Residuals), values: &[f64]) -> f64 {
     let items = runs.parts.iter().flat_map(|part| &part.asks.items);
     let of = |(k, item): (usize, &crate::compile::FitItem)| {
-        let (noise, residuals) = (&answer.noise[k], &answer.residuals[k]);
+        let (noise, residuals) = (&noise[k], &residuals[k]);
         let n = residuals.len() as f64;
         with(|with| match item.sd {
             Some(_) => noise.whitened(residuals).iter().map(|r| r * r).sum::<f64>() + n * (with.log)(noise.innovation),
@@ -174,8 +194,8 @@ pub fn misfit(runs: &Runs, answer: &Answer, values: &[f64]) -> f64 {
 /// The profile of an unknown. An error is a point with a smaller misfit than the answer has.
 pub fn profile(runs: &Runs, (answer, steps, _): &Found, settings: Settings, k: usize) -> Result<Profile, Vec<f64>> {
     let n = runs.unknowns.len();
-    let unknown = &runs.asked(&answer.values).0[k];
-    let least = misfit(runs, answer, &answer.values);
+    let (settings, unknown) = (settings.like(answer), &runs.asked(&answer.values)[k]);
+    let least = misfit(runs, (&answer.weights, &answer.residuals), &answer.values);
     let free: Vec<usize> = (0..n).filter(|other| *other != k).collect();
     let (low, high) = with(|with| unknown.bounds(with));
     let middle = with(|with| unknown.coordinate(answer.values[k], with));
@@ -188,7 +208,8 @@ pub fn profile(runs: &Runs, (answer, steps, _): &Found, settings: Settings, k: u
         let mut base = answer.values.clone();
         let mut at = |x: f64, base: &mut Vec<f64>| {
             base[k] = with(|with| unknown.value(x, with));
-            let rise = rise(runs, answer, steps, settings, (&free, base)) - least;
+            // Where the residuals are no noise, their likelihood says as much less as the variance is larger.
+            let rise = (rise(runs, answer, steps, settings, (&free, base)) - least) / answer.inflation[k];
             if rise.is_finite() {
                 points.push((base[k], rise.max(0.0)));
             }
@@ -254,11 +275,12 @@ fn rise(
         return alone(runs, answer, base, steps).unwrap_or(f64::INFINITY);
     }
     let mut run = |points: &[Vec<f64>]| runs.residuals(Way::Whole, points, steps);
-    let Ok(found) = restricted(runs, base, free, settings, &mut run) else { return f64::INFINITY };
+    let items = runs.compared_whole();
+    let Ok(found) = restricted(runs, base, free, settings, (&items, &mut run)) else { return f64::INFINITY };
     for (at, other) in free.iter().enumerate() {
         base[*other] = found.values[at];
     }
-    misfit(runs, &found, base)
+    misfit(runs, (&found.weights, &found.residuals), base)
 }
 
 /// The misfit with these values, under the noise model of the answer.
@@ -269,12 +291,11 @@ fn alone(runs: &Runs, answer: &Answer, values: &[f64], steps: &[f64]) -> Option<
         let part = whitened.iter().map(|r| r * r).sum::<f64>() / whitened.len().max(1) as f64;
         Noise { variance: noise.variance * part, ..noise.clone() }
     };
-    let noise: Vec<Noise> = answer.noise.iter().zip(&residuals).map(scaled).collect();
+    let noise: Vec<Noise> = answer.weights.iter().zip(&residuals).map(scaled).collect();
     let known: Vec<bool> = runs.parts.iter().flat_map(|part| &part.asks.items).map(|item| item.sd.is_some()).collect();
-    let noise = noise.into_iter().zip(&answer.noise).zip(known);
-    let noise = noise.map(|((new, old), known)| if known { old.clone() } else { new }).collect();
-    let changed = Answer { residuals, noise, ..answer.clone() };
-    Some(misfit(runs, &changed, values))
+    let noise = noise.into_iter().zip(&answer.weights).zip(known);
+    let noise: Vec<Noise> = noise.map(|((new, old), known)| if known { old.clone() } else { new }).collect();
+    Some(misfit(runs, (&noise, &residuals), values))
 }
 
 /// A recording that was judged and not fitted.
@@ -282,7 +303,7 @@ pub struct Judged {
     /// What it is called.
     pub label: String,
     /// Values of the unknowns that are its own, by their labels.
-    pub own: Vec<(String, f64, abi::unit::Unit)>,
+    pub own: Vec<(String, f64, Unit)>,
     /// What the fit leaves of it, for each compared quantity.
     pub residuals: Residuals,
 }
@@ -305,7 +326,7 @@ pub fn judge(runs: &Runs, (answer, steps, _): &Found, settings: Settings) -> Vec
         let own: Vec<usize> = (0..values.len()).filter(|k| judged.unknowns[*k].of.is_some()).collect();
         if !own.is_empty() {
             let mut run = |points: &[Vec<f64>]| judged.residuals(Way::Whole, points, &steps);
-            let found = restricted(judged, &values, &own, settings, &mut run);
+            let found = restricted(judged, &values, &own, settings, (&judged.compared_whole(), &mut run));
             for (at, k) in own.iter().enumerate() {
                 if let Ok(found) = &found {
                     values[*k] = found.values[at];
@@ -334,8 +355,9 @@ pub fn held_out(runs: &Runs, found: &Found, settings: Settings) -> Option<Residu
     let mut out: Residuals = answer.residuals.iter().map(|rows| vec![0.0; rows.len()]).collect();
     let free: Vec<usize> = (0..runs.unknowns.len()).collect();
     for half in [0, 1] {
+        let items = runs.compared(&|part| seen(part, half));
         let mut run = |points: &[Vec<f64>]| runs.residuals_at(points, steps, &|part| seen(part, half));
-        let values = restricted(runs, &answer.values, &free, settings, &mut run).ok()?.values;
+        let values = restricted(runs, &answer.values, &free, settings.like(answer), (&items, &mut run)).ok()?.values;
         let all = runs.residuals(Way::Whole, &[values], steps).remove(0).ok()?;
         for (part, items) in runs.parts.iter().zip(runs.items()) {
             let is_unseen = seen(part, 1 - half);
@@ -355,7 +377,9 @@ pub fn held_out(runs: &Runs, found: &Found, settings: Settings) -> Option<Residu
 #[derive(Default)]
 pub struct Remarks {
     /// The quantity on which they depend: its name, and how.
-    pub depends: Option<(String, abi::unit::Unit, Dependence)>,
+    pub depends: Option<(String, Unit, Dependence)>,
+    /// The quantity in a class of whose values most of the error lies.
+    pub lies: Option<(String, Unit, Dependence)>,
     /// Rows that hold most of the error.
     pub outliers: Option<Outliers>,
     /// The beginning fits badly.
@@ -368,10 +392,10 @@ pub fn remarks(part: &Part, answer: &Answer, items: std::ops::Range<usize>) -> V
         let (after, before) = part.asks.window;
         (0..part.asks.rows.len()).filter(|row| (after..=before).contains(&part.asks.rows[*row])).collect()
     };
-    let mut names: Vec<(String, abi::unit::Unit)> = Vec::new();
+    let mut names: Vec<(String, Unit)> = Vec::new();
     let mut columns: Vec<Vec<f64>> = Vec::new();
     if !part.asks.steady {
-        names.push(("t".into(), abi::unit::Unit::parse("s").expect("it is known")));
+        names.push(("t".into(), Unit::parse("s").expect("it is known")));
         columns.push(part.instants.clone());
     }
     // Residuals depend on what they were computed from.
@@ -380,17 +404,35 @@ pub fn remarks(part: &Part, answer: &Answer, items: std::ops::Range<usize>) -> V
     for (name, unit, values) in part.asks.columns.iter().filter(|(name, ..)| !is_compared(name)) {
         names.push((name.clone(), unit.clone()));
         columns.push(rows.iter().map(|row| values[*row]).collect());
+        // A sensor that is late or has inertia leaves what the rate of the motion explains.
+        let times = &part.asks.rows;
+        if !part.asks.steady && times.len() > 2 {
+            let text = if unit.text.is_empty() { "1/s".into() } else { format!("{}/s", unit.text) };
+            names.push((format!("slope({name})"), Unit { text, ..unit.clone() }));
+            let slope = |row: &usize| {
+                let (a, b) = (row.saturating_sub(1), (row + 1).min(times.len() - 1));
+                (values[b] - values[a]) / (times[b] - times[a])
+            };
+            columns.push(rows.iter().map(slope).collect());
+        }
     }
+    let states: Vec<usize> = (0..names.len()).filter(|k| names[*k].0.starts_with("data.")).collect();
     let one = |(k, item): (usize, &crate::compile::FitItem)| {
-        let kept = item.kept(&part.instants);
+        let left = item.kept(&part.instants);
         let columns: Vec<Vec<f64>> =
-            columns.iter().map(|column| kept.iter().map(|row| column[*row]).collect()).collect();
+            columns.iter().map(|column| left.iter().map(|row| column[*row]).collect()).collect();
         let slices: Vec<&[f64]> = columns.iter().map(Vec::as_slice).collect();
+        let of_states: Vec<&[f64]> = states.iter().map(|k| slices[*k]).collect();
         let (residuals, noise) = (&answer.residuals[k], &answer.noise[k]);
-        let white = noise.whitened(residuals);
-        let found = with(|with| statistics::dependence(residuals, &white, &slices, with));
+        let (kept, white): (Vec<usize>, _) = (noise.kept(residuals.len()).collect(), noise.whitened(residuals));
+        let found = with(|with| statistics::dependence(residuals, (&kept, &white), &slices, with));
         let depends = found.map(|found| {
             let (name, unit) = names[found.column].clone();
+            (name, unit, found)
+        });
+        let found = statistics::concentration(residuals, &of_states).filter(|_| depends.is_none());
+        let lies = found.map(|found| {
+            let (name, unit) = names[states[found.column]].clone();
             (name, unit, found)
         });
         let begins_badly = !part.asks.steady && statistics::begins_badly(residuals);
@@ -399,13 +441,15 @@ pub fn remarks(part: &Part, answer: &Answer, items: std::ops::Range<usize>) -> V
             let head = residuals.len() / 10;
             found.rows.iter().all(|row| *row < head) && found.tenth.as_ref().is_none_or(|tenth| tenth.start == 0)
         };
-        let outliers = statistics::outliers(residuals, &white).filter(|found| !(begins_badly && is_beginning(found)));
+        let outliers =
+            statistics::outliers(residuals, (&kept, &white)).filter(|found| !(begins_badly && is_beginning(found)));
         let of_rows = |found: Outliers| Outliers {
-            rows: found.rows.into_iter().map(|row| kept[row]).collect(),
-            tenth: found.tenth.map(|tenth| kept[tenth.start]..kept[tenth.end - 1] + 1),
+            rows: found.rows.into_iter().map(|row| left[row]).collect(),
+            tenth: found.tenth.map(|tenth| left[tenth.start]..left[tenth.end - 1] + 1),
         };
-        let outliers = outliers.map(of_rows);
-        Remarks { depends, outliers, begins_badly }
+        // Where the error lies in values of a column, its largest rows are no outliers.
+        let outliers = outliers.map(of_rows).filter(|_| lies.is_none());
+        Remarks { depends, lies, outliers, begins_badly }
     };
     items.zip(&part.asks.items).map(one).collect()
 }

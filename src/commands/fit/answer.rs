@@ -221,8 +221,26 @@ impl Fitted {
                     let share = significant(100.0 * found.share, 2);
                     let label = format!("{share} % of its variance, most {}", class(found, unit));
                     let warning = Diagnostic::warning("W0903", message).label(runs.name, label);
+                    let help = match name.starts_with("slope(") {
+                        true => {
+                            "the sensor may be late: in a model around the law, `output F [N] = delay(law.F, T)` and `vary T`; or a mass is accelerated"
+                        }
+                        false => {
+                            "the law lacks something that the recording shows; compare others, or look at the residuals with `--report`"
+                        }
+                    };
+                    all.push(("model-error", warning.help(help)));
+                }
+                if let Some((name, unit, found)) = &remarks.lies {
+                    let message = format!(
+                        "most of the error of `{}`{of} lies where `{name}` is {}",
+                        item.text,
+                        class(found, unit)
+                    );
+                    let label = format!("{} % of its square", significant(100.0 * found.share, 2));
+                    let warning = Diagnostic::warning("W0903", message).label(runs.name, label);
                     all.push(("model-error", warning.help(
-                        "the law lacks something that the recording shows; compare others, or look at the residuals with `--report`",
+                        "the law says something else there; at rest a contact bears any force up to its stiction: compare a law with states, or leave these rows out",
                     )));
                 }
                 if remarks.outliers.is_some() {
@@ -363,7 +381,8 @@ impl Fitted {
                     None => String::new(),
                 };
                 let rms = show(answer.rms[k], &item.unit, 4);
-                out += &format!("{indent}rms({})  {rms}, {colour}{of_given}\n", item.shown());
+                let no_noise = if answer.misfits && noise.order() > 0 { ", no noise" } else { "" };
+                out += &format!("{indent}rms({})  {rms}, {colour}{no_noise}{of_given}\n", item.shown());
             }
             out += &results::verdicts(terminal, &run.verdicts, None, None, indent);
         }
@@ -528,6 +547,7 @@ impl Fitted {
             "parameters": parameters,
             "correlation": (0..n).map(row).collect::<Vec<_>>(),
             "undetermined": open,
+            "no_noise": answer.misfits,
             "chi_square": number(answer.chi_square),
             "degrees_of_freedom": number(answer.degrees),
             "rank": self.rank.map(|(rank, _)| rank),
@@ -665,6 +685,10 @@ pub fn said(remarks: &Remarks, part: &Part) -> String {
             class(found, unit)
         ));
     }
+    if let Some((name, unit, found)) = &remarks.lies {
+        let share = significant(100.0 * found.share, 2);
+        all.push(format!("{share} % of its square where {name} is {}", class(found, unit)));
+    }
     if let Some(found) = &remarks.outliers {
         if let [first, .., last] | [first @ last] = &found.rows[..] {
             let rows = count(found.rows.len() as u64);
@@ -700,6 +724,7 @@ fn at(part: &Part, first: usize, last: usize) -> String {
 pub fn class(found: &Dependence, unit: &Unit) -> String {
     let value = |si: f64| show(si, unit, 3);
     match found.edge {
+        _ if found.class.0 == found.class.1 => value(found.class.0),
         (true, _) => format!("below {}", value(found.class.1)),
         (_, true) => format!("above {}", value(found.class.0)),
         _ => format!("between {} and {}", value(found.class.0), value(found.class.1)),

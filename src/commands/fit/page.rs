@@ -163,7 +163,10 @@ fn compared(fitted: &Fitted, runs: &Runs) -> String {
         for ((item, k), remarks) in part.asks.items.iter().zip(items).zip(&run.remarks) {
             let of = if runs.parts.len() > 1 { format!("{}: ", part.asks.label) } else { String::new() };
             let order = fitted.answer.noise[k].order();
-            let noise = if order == 0 { "white".to_string() } else { format!("autoregressive of order {order}") };
+            let mut noise = if order == 0 { "white".to_string() } else { format!("autoregressive of order {order}") };
+            if fitted.answer.misfits && order > 0 {
+                noise += ", but no noise: values by least squares";
+            }
             let _ = writeln!(
                 out,
                 "<tr><td>{}</td><td class=\"n\">{}</td><td class=\"n\">{}</td><td>{noise}</td><td>{}</td></tr>",

@@ -105,7 +105,8 @@ fn table(title: &str, tried: &[Tried], ranks: &[(usize, usize)]) -> String {
         let (answer, ..) = one.found.as_ref().ok()?;
         let rows: usize = answer.residuals.iter().map(Vec::len).sum();
         let parameters = one.runs.unknowns.len() as f64;
-        Some(after::misfit(&one.runs, answer, &answer.values) + parameters * log.at(rows as f64))
+        let misfit = after::misfit(&one.runs, (&answer.noise, &answer.residuals), &answer.values);
+        Some(misfit + parameters * log.at(rows as f64))
     };
     let least = tried.iter().filter_map(&criterion).fold(f64::INFINITY, f64::min);
     let mut table = vec![["", "law", "parameters", "rms", "held out", "ΔBIC", "than the next"].map(str::to_string)];

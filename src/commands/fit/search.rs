@@ -10,11 +10,12 @@ use abi::plan::{Experiment, Method};
 use abi::{Instance, Slot};
 use grammar::span::Span;
 use runtime::engine::{self, Cause, Continue, Failure, lanes};
-use runtime::fit::{Answer, Elementary, Item, Minima, Question, Trouble, Unknown, Way};
+use runtime::fit::statistics::intervals;
+use runtime::fit::{Answer, Elementary, Estimator, Item, Limits, Minima, Question, Rows, Trouble, Unknown, Way};
 use std::ops::Range;
 
-/// Most trial points of a stage of the search.
-const TRIALS: u32 = 100;
+/// When a search ends.
+const LIMITS: Limits = Limits { trials: 100, tolerance: 1e-8 };
 /// A step is short enough if half of it changes no residual by more than this part of the noise.
 const PART_OF_NOISE: f64 = 0.1;
 /// How often a step is halved at most.
@@ -143,7 +144,7 @@ impl Part {
             Method::Adaptive => {}
             _ => experiment.solver.step = step,
         }
-        if let (Way::First(_), Some(last)) = (way, instants.last()) {
+        if let Some(last) = instants.last().filter(|last| **last < experiment.duration) {
             experiment.duration = *last;
             experiment.corners.retain(|t| t < last);
         }
@@ -296,8 +297,8 @@ impl Runs {
         self.parts.iter().map(|part| part.asks.rows.len()).sum()
     }
 
-    /// The search's view of what is asked, from these starts.
-    pub fn asked(&self, starts: &[f64]) -> (Vec<Unknown>, Vec<Item>) {
+    /// The search's view of the unknowns, from these starts.
+    pub fn asked(&self, starts: &[f64]) -> Vec<Unknown> {
         let unknown = |(one, start): (&compile::FitUnknown, &f64)| Unknown {
             low: one.range.0,
             high: one.range.1,
@@ -305,11 +306,30 @@ impl Runs {
             known: one.known,
             above: one.above,
         };
-        let items = self
-            .parts
-            .iter()
-            .flat_map(|part| part.asks.items.iter().map(|item| Item { sd: item.sd, independent: part.asks.steady }));
-        (self.unknowns.iter().zip(starts).map(unknown).collect(), items.collect())
+        self.unknowns.iter().zip(starts).map(unknown).collect()
+    }
+
+    /// The search's view of what is compared at some of the compared rows of each recording.
+    pub(super) fn compared(&self, rows: &dyn Fn(&Part) -> Vec<usize>) -> Vec<Item> {
+        let of = |part: &Part| {
+            let times: Vec<f64> = rows(part).into_iter().map(|row| part.instants[row]).collect();
+            let one = |item: &compile::FitItem| {
+                let times: Vec<f64> = item.kept(&times).into_iter().map(|row| times[row]).collect();
+                let rows = match intervals(&times) {
+                    _ if part.asks.steady => Rows::Independent,
+                    Some(gaps) => Rows::Even(gaps),
+                    None => Rows::Uneven,
+                };
+                Item { sd: item.sd, rows }
+            };
+            part.asks.items.iter().map(one).collect::<Vec<_>>()
+        };
+        self.parts.iter().flat_map(of).collect()
+    }
+
+    /// The same at all of them.
+    pub fn compared_whole(&self) -> Vec<Item> {
+        self.compared(&|part| (0..part.instants.len()).collect())
     }
 
     /// What is known of other minima.
@@ -410,12 +430,27 @@ pub struct Settings {
     pub starts: Option<usize>,
     /// Seed of those that are not written.
     pub seed: u64,
+    /// How the values are estimated.
+    pub estimator: Estimator,
+    /// When a search ends.
+    pub limits: Limits,
 }
 
 impl Settings {
+    /// Those that nothing changes.
+    pub fn new(level: f64) -> Settings {
+        Settings { level, starts: None, seed: 0, estimator: Estimator::Chosen, limits: LIMITS }
+    }
+
     /// As the command line states it.
     pub fn of(args: &args::Fit) -> Settings {
-        Settings { level: args.level, starts: args.starts, seed: args.seed }
+        Settings { starts: args.starts, seed: args.seed, ..Settings::new(args.level) }
+    }
+
+    /// The same, with estimates like those of an answer.
+    pub(super) fn like(self, answer: &Answer) -> Settings {
+        let estimator = if answer.misfits { Estimator::LeastSquares } else { Estimator::Whitened };
+        Settings { estimator, ..self }
     }
 }
 
@@ -441,9 +476,10 @@ pub(super) fn estimate(
         run,
         with: Elementary { exp: &|x| exp.at(x), log: &|x| log.at(x) },
         level: settings.level,
-        trials: TRIALS,
+        limits: settings.limits,
         starts: settings.starts.unwrap_or(if runs.minima().regimes { STARTS_WITH_REGIMES } else { STARTS }),
         seed: settings.seed,
+        estimator: settings.estimator,
     })
 }
 
@@ -459,7 +495,7 @@ pub fn search_from(runs: &Runs, values: &[f64], settings: Settings) -> Result<Fo
 }
 
 fn searched(runs: &Runs, written: &[f64], settings: Settings) -> Result<Found, Trouble> {
-    let (mut unknowns, items) = runs.asked(written);
+    let (mut unknowns, items) = (runs.asked(written), runs.compared_whole());
     let mut steps = runs.steps();
     let mut spent = 0;
     let mut judged = None;
