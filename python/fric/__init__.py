@@ -8,12 +8,14 @@
 
 from fric._fric import Batch, Native, Stepper, __version__
 from fric._model import Explanation, Linear, Model, Quantity, Run, Study, Text, Verdict, load, loads, model
+from fric._sweep import Table, lognormal, normal, sweep, uniform
 from fric.errors import (
     CompileError,
     Diagnostic,
     InternalError,
     RangeError,
     RunError,
+    SweepError,
     UnitError,
     UnknownName,
 )
@@ -33,6 +35,8 @@ __all__ = [
     "RunError",
     "Stepper",
     "Study",
+    "SweepError",
+    "Table",
     "Text",
     "UnitError",
     "UnknownName",
@@ -40,5 +44,9 @@ __all__ = [
     "__version__",
     "load",
     "loads",
+    "lognormal",
     "model",
+    "normal",
+    "sweep",
+    "uniform",
 ]

@@ -12,6 +12,7 @@ __all__ = [
     "InternalError",
     "RangeError",
     "RunError",
+    "SweepError",
     "UnitError",
     "UnknownName",
 ]
@@ -112,6 +113,17 @@ class RunError(RuntimeError):
 
     def __reduce__(self) -> Any:
         return type(self), (self.cause, self.time)
+
+
+class SweepError(RuntimeError):
+    """A sweep that is not complete: ``missing`` are the ranges of runs without a row, (first, last + 1)."""
+
+    def __init__(self, message: str, missing: list[tuple[int, int]]):
+        super().__init__(message)
+        self.missing = missing
+
+    def __reduce__(self) -> Any:
+        return type(self), (str(self), self.missing)
 
 
 class InternalError(RuntimeError):

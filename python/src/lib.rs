@@ -12,6 +12,7 @@ mod text;
 mod native;
 mod stepper;
 mod batch;
+mod sweep;
 
 use abi::unit::Unit;
 use pyo3::exceptions::PyValueError;
@@ -32,6 +33,8 @@ mod _fric {
     use crate::native::Native;
     #[pymodule_export]
     use crate::stepper::Stepper;
+    #[pymodule_export]
+    use crate::sweep::{SweepRows, sweep_plan, sweep_unit};
     #[pymodule_export]
     use crate::text::{Run, Text, arrow_stream};
     use abi::unit::Unit;

@@ -176,6 +176,11 @@ impl Text {
 }
 
 impl Text {
+    /// What the command embeds.
+    pub fn inner(&self) -> &embed::Text {
+        &self.text
+    }
+
     /// Its name and the text.
     pub fn source_text(&self) -> (String, String) {
         self.text.source()

@@ -19,6 +19,11 @@ pub struct Progress {
 }
 
 impl Progress {
+    /// Set when the work must stop.
+    pub fn stop(&self) -> &AtomicBool {
+        &self.stop
+    }
+
     /// Reports the fraction done, and whether to go on.
     pub fn report(&self, fraction: f64) -> Continue {
         self.done.store(fraction.to_bits(), Ordering::Relaxed);
