@@ -14,6 +14,7 @@ const EACH = 12;
 const NAMED = 200;
 
 const element = (/** @type {string} */ id) => /** @type {HTMLElement} */ (document.getElementById(id));
+const control = (/** @type {string} */ id) => /** @type {HTMLButtonElement} */ (document.getElementById(id));
 const input = (/** @type {string} */ id) => /** @type {HTMLInputElement} */ (document.getElementById(id));
 
 let /** @type {any} */ hello = null, /** @type {any} */ state = null;
@@ -180,19 +181,16 @@ function chair() {
   place.replaceChildren(text, ...acts.map(act => button(words[/** @type {'take' | 'refuse' | 'give'} */ (act)], () => say(act, problem))));
 }
 
-/** What was kept of a rig under a letter: the values of its parameters, the window, and its curves by what they stand over. @type {Map<string, { texts: string[], span: [number, number], curves: { signal: number, against: number | null, x: Float64Array, y: Float64Array }[], shown: boolean }>} */
+/** What was kept of a rig under a letter: the values of its parameters, the window, and its curves by what they stand over. @type {Map<string, { texts: string[], span: [number, number], curves: any[], shown: boolean }>} */
 const keptOf = new Map();
 
 /** Keeps the values in effect and the curves that are shown. @param {string} letter */
 function keepAs(letter) {
-  const [from, to] = span(), curves = plots.flatMap(one => [...one.curves].filter(([number]) => parts(number).layer === 0).map(([number, { x, y }]) => {
-    const { signals, against } = one.canvas, signal = parts(number).signal;
-    if (!signals.includes(signal)) return null;
+  const [from, to] = span(), curves = plots.flatMap(({ canvas: { signals, against }, curves }) => [...curves].filter(([signal]) => signals.includes(signal)).map(([signal, { x, y }]) => {
     // As they are now: a later frame adds to them.
-    const inside = (/** @type {number} */ i) => against !== null || x[i] >= from && x[i] <= to;
-    const all = [...x.keys()].filter(inside);
+    const all = [...x.keys()].filter(i => against !== null || x[i] >= from && x[i] <= to);
     return { signal, against, x: Float64Array.from(all, i => x[i]), y: Float64Array.from(all, i => y[i]) };
-  }).filter(curve => curve !== null));
+  }));
   keptOf.set(letter, { texts: [...state.texts], span: [from, to], curves, shown: true });
   keeps(true);
   legend();
@@ -213,10 +211,9 @@ const KEPT_DASHES = { A: [9, 4], B: [3, 3] };
 function keeps(anew = false) {
   const text = state.set || words.none, place = element('kept');
   if (input('set').value !== text) input('set').value = text;
-  /** @type {HTMLButtonElement} */ (element('copied')).disabled = !state.set;
+  control('copied').disabled = !state.set;
   if (place.childElementCount > 0 && !anew) return;
-  const focus = document.activeElement?.textContent;
-  place.replaceChildren(...['A', 'B'].flatMap(letter => {
+  renew(place, ['A', 'B'].flatMap(letter => {
     const kept = keptOf.get(letter);
     return [button(words.keep(letter), () => keepAs(letter)), ...kept ? [
       button(words.goStaged(letter), () => knobs?.prepare(kept.texts, state.texts)),
@@ -228,8 +225,6 @@ function keeps(anew = false) {
       }, kept.shown),
     ] : []];
   }));
-  const again = [...place.children].find(one => one.textContent === focus);
-  if (again instanceof HTMLElement) again.focus();
 }
 
 /** The answers of the rig to this page. */
@@ -275,7 +270,7 @@ function begin(/** @type {any} */ is) {
     const plane = canvas.against !== null;
     return { plot: new Plot(element(plane ? 'planes' : 'times'), plane), canvas, curves: new Map() };
   });
-  const times = plots.filter(one => !one.plot.plane);
+  const times = overTime();
   times.forEach(one => {
     one.plot.title = words.time;
     follow(one.plot);
@@ -301,12 +296,12 @@ function begin(/** @type {any} */ is) {
   if (knobs) knobs.onstaged = () => {
     const n = knobs?.staged.size ?? 0;
     element('apply').textContent = words.apply(n);
-    for (const id of ['apply', 'discard']) /** @type {HTMLButtonElement} */ (element(id)).disabled = n === 0 || id === 'apply' && !operates();
+    for (const id of ['apply', 'discard']) control(id).disabled = n === 0 || id === 'apply' && !operates();
   };
   if (guest) for (const one of element('rows').querySelectorAll('input')) one.disabled = true;
   knobs?.onstaged();
   if (knobs) {
-    knobs.onundo = () => { /** @type {HTMLButtonElement} */ (element('undo')).disabled = knobs?.before.length === 0; };
+    knobs.onundo = () => { control('undo').disabled = knobs?.before.length === 0; };
     knobs.onundo();
   }
   listed = '';
@@ -315,13 +310,32 @@ function begin(/** @type {any} */ is) {
   resize();
 }
 
+/** @param {string} name @param {Node[]} of */
+function group(name, ...of) {
+  const made = document.createElement('div');
+  made.setAttribute('role', 'group');
+  made.setAttribute('aria-label', name);
+  made.append(...of);
+  return made;
+}
+
+/** Replaces what is in a place; a button with the same text keeps the focus. @param {HTMLElement} place @param {Node[]} made */
+function renew(place, made) {
+  const focus = place.contains(document.activeElement) && document.activeElement?.textContent;
+  place.replaceChildren(...made);
+  if (focus) [...place.querySelectorAll('button')].find(one => one.textContent === focus)?.focus();
+}
+
+/** @param {Element} button @param {boolean} is */
+const press = (button, is) => button.setAttribute('aria-pressed', String(is));
+
 /** @param {string} text @param {() => void} act @param {boolean} [pressed] */
 function button(text, act, pressed) {
   const made = document.createElement('button');
   made.type = 'button';
   made.textContent = text;
   made.onclick = act;
-  if (pressed !== undefined) made.setAttribute('aria-pressed', String(pressed));
+  if (pressed !== undefined) press(made, pressed);
   return made;
 }
 
@@ -364,21 +378,15 @@ function baseLayer() {
 
 /** The models that fit each slot, one press each. */
 function slots() {
-  const place = element('models'), focus = document.activeElement?.closest('#models') && document.activeElement.textContent;
-  place.replaceChildren(...(saved ? [] : hello.slots ?? []).map((/** @type {any} */ slot, /** @type {number} */ at) => {
-    const group = document.createElement('div'), name = document.createElement('b');
-    group.setAttribute('role', 'group');
-    group.setAttribute('aria-label', words.slot(slot.path, slot.interface));
+  renew(element('models'), (saved ? [] : hello.slots ?? []).map((/** @type {any} */ slot, /** @type {number} */ at) => {
+    const name = document.createElement('b');
     name.textContent = slot.path;
-    group.append(name, ...slot.fits.map((/** @type {string} */ model) => {
+    return group(words.slot(slot.path, slot.interface), name, ...slot.fits.map((/** @type {string} */ model) => {
       const made = button(model, () => say(`slot ${slot.path} = ${model}`, problem), false);
       made.dataset.slot = String(at);
       return made;
     }));
-    return group;
   }));
-  // The one that was pressed is pressed again, and keeps the focus.
-  for (const one of place.querySelectorAll('button')) if (focus && one.textContent === focus) one.focus();
 }
 
 /** A canvas in the plane of a contact shows its force over speed or position, or its speed over position: one press each. @param {{ plot: Plot, canvas: any, curves: Map<number, any> }} one */
@@ -386,22 +394,20 @@ function presses(one) {
   const { canvas, plot } = one, phase = (hello.phases ?? []).find((/** @type {any} */ of) => of.speed === canvas.against && of.force === canvas.signals[0]);
   plot.title = hello.signals[canvas.against].unit;
   if (!phase || phase.position === null) return;
-  const place = document.createElement('div'), label = (/** @type {number} */ signal) => hello.signals[signal].label;
-  place.className = 'presses';
-  place.setAttribute('role', 'group');
-  place.setAttribute('aria-label', words.plane(label(phase.force), label(phase.speed)));
+  const label = (/** @type {number} */ signal) => hello.signals[signal].label;
   const made = [[phase.force, phase.speed], [phase.force, phase.position], [phase.speed, phase.position]].map(([y, x]) => button(words.plane(label(y), label(x)), () => {
     one.canvas = { signals: [y], against: x };
     one.curves.clear();
     [plot.empty, plot.title] = [true, hello.signals[x].unit];
-    made.forEach(other => other.setAttribute('aria-pressed', String(other === made.find(own => own.textContent === words.plane(label(y), label(x))))));
+    made.forEach(other => press(other, other.textContent === words.plane(label(y), label(x))));
     names(one);
     if (saved) for (const curve of link.saved) placed(one, curve, true);
     asked = false;
     tell();
     wake();
   }, y === canvas.signals[0] && x === canvas.against));
-  place.replaceChildren(...made);
+  const place = group(words.plane(label(phase.force), label(phase.speed)), ...made);
+  place.className = 'presses';
   plot.root.prepend(place);
 }
 
@@ -410,20 +416,25 @@ function names(one) {
   const { canvas, plot } = one, several = hello.cases.length > 1;
   const entries = canvas.signals.flatMap((/** @type {number} */ signal) => hello.cases.map((/** @type {string} */ label, /** @type {number} */ at) => ({ signal, label, at })));
   plot.names.replaceChildren(...entries.map((/** @type {any} */ entry) => {
-    const item = document.createElement('li'), line = document.createElement('canvas'), value = document.createElement('b');
-    line.className = 'sample';
-    line.setAttribute('aria-hidden', 'true');
+    const item = document.createElement('li'), value = document.createElement('b');
     const curve = (baseLayer() * hello.cases.length + entry.at) * hello.signals.length + entry.signal;
     const { label, unit } = hello.signals[entry.signal];
     const over = canvas.against === null ? label : words.plane(label, hello.signals[canvas.against].label);
     const name = several && entry.label ? `${over}, ${entry.label}` : over;
     const rms = document.createElement('small');
-    item.append(line, `${name} `, value, unit ? ` ${unit}` : '', rms);
+    item.append(sampled(look(canvas, curve)), `${name} `, value, unit ? ` ${unit}` : '', rms);
     item.dataset.curve = String(curve);
-    const style = look(canvas, curve);
-    requestAnimationFrame(() => sample(line, style.colour, style.dash));
     return item;
   }));
+}
+
+/** Canvases over time. */
+const overTime = () => plots.filter(one => !one.plot.plane);
+
+/** A curve with its unit, in words. @param {number} curve */
+function titled(curve) {
+  const { signal, case: at } = parts(curve), { label, unit } = hello.signals[signal];
+  return [label, hello.cases[at], unit && `in ${unit}`].filter(Boolean).join(' ');
 }
 
 /** All there is. @returns {[number, number]} */
@@ -614,7 +625,7 @@ function show() {
       chair();
       answers();
       knobs?.onstaged();
-      /** @type {HTMLButtonElement} */ (element('mark')).disabled = !operates();
+      control('mark').disabled = !operates();
     }
     events();
     if (newest && hello.grows && state.grows === false) move(span());
@@ -628,19 +639,19 @@ function show() {
   if (knobs && hello.kind === 'what if') {
     knobs.live = state.short;
     input('set').value = state.set || words.none;
-    /** @type {HTMLButtonElement} */ (element('copied')).disabled = !state.set;
-    /** @type {HTMLButtonElement} */ (element('text')).disabled = !state.set;
-    element('kept').replaceChildren(...['A', 'B'].flatMap((letter, i) => [
+    control('copied').disabled = !state.set;
+    control('text').disabled = !state.set;
+    renew(element('kept'), ['A', 'B'].flatMap((letter, i) => [
       button(words.keep(letter), () => say(`keep ${letter}`, problem)),
       ...(state.kept[i] ? [button(words.go(letter), () => { knobs?.touch(-2); knobs?.release(); say(`go ${letter}`, problem); })] : []),
     ]));
   }
   for (const one of element('models').querySelectorAll('button')) {
-    const there = String(state.models?.[Number(one.dataset.slot)] === one.textContent), group = one.parentElement;
-    if (one.getAttribute('aria-pressed') === there || !group) continue;
-    one.setAttribute('aria-pressed', there);
+    const there = state.models?.[Number(one.dataset.slot)] === one.textContent, place = one.parentElement;
+    if (one.getAttribute('aria-pressed') === String(there) || !place) continue;
+    press(one, there);
     // The model that is there is in sight.
-    if (there === 'true') group.scrollTop = one.offsetTop - group.offsetTop - one.offsetHeight;
+    if (there) place.scrollTop = one.offsetTop - place.offsetTop - one.offsetHeight;
   }
   const verdicts = state.run?.verdicts ?? [];
   element('verdicts').hidden = verdicts.length === 0;
@@ -660,36 +671,33 @@ function show() {
 
 /** What the ghosts are. */
 function legend() {
+  const rig = hello.kind !== 'what if', [, once, anew, steady] = state.layers;
+  if (rig) element('free').hidden = !(once && anew);
+  const kept = rig ? [...keptOf.keys()].filter(letter => keptOf.get(letter)?.shown).sort() : ['A', 'B'].filter((_, i) => state.layers[2 + i]);
+  explain([
+    ...(rig ? once || anew : state.layers[0]) ? [{ text: !rig ? words.drawn : free || !anew ? words.twin : words.ahead, colour: '--ghost', dash: [5, 4] }] : [],
+    ...rig && steady ? [{ text: words.steady, colour: '--faint', dash: [2, 3] }] : [],
+    ...kept.map(letter => ({ text: letter, colour: '--c0', dash: KEPT_DASHES[letter] })),
+  ]);
+}
+
+/** Shows lines beside their names. @param {{ text: string, colour: string, dash: number[] }[]} entries */
+function explain(entries) {
   const place = element('legend');
-  if (hello.kind !== 'what if') {
-    const there = state.layers[1] || state.layers[2], text = free || !state.layers[2] ? words.twin : words.ahead;
-    element('free').hidden = !(state.layers[1] && state.layers[2]);
-    const kept = [...keptOf].filter(([, one]) => one.shown).map(([letter]) => letter).sort();
-    const entries = [
-      ...there ? [{ text, colour: '--ghost', dash: [5, 4] }] : [],
-      ...state.layers[3] ? [{ text: words.steady, colour: '--faint', dash: [2, 3] }] : [],
-      ...kept.map(letter => ({ text: letter, colour: '--c0', dash: KEPT_DASHES[letter] })),
-    ];
-    if (place.textContent === entries.map(one => one.text).join('')) return;
-    return place.replaceChildren(...entries.map(one => {
-      const item = document.createElement('span'), line = document.createElement('canvas');
-      line.className = 'sample';
-      line.setAttribute('aria-hidden', 'true');
-      item.append(line, one.text);
-      requestAnimationFrame(() => sample(line, one.colour, one.dash));
-      return item;
-    }));
-  }
-  const shown = state.layers.map((/** @type {boolean} */ drawn, /** @type {number} */ layer) => ({ drawn, layer })).filter((/** @type {any} */ one) => one.drawn && words.drawn[one.layer] && hello.kind === 'what if');
-  place.replaceChildren(...shown.map((/** @type {any} */ one) => {
-    const item = document.createElement('span'), line = document.createElement('canvas');
-    line.className = 'sample';
-    line.setAttribute('aria-hidden', 'true');
-    item.append(line, words.drawn[one.layer]);
-    const dash = one.layer === 0 ? [5, 4] : one.layer === 2 ? [9, 4] : [3, 3];
-    requestAnimationFrame(() => sample(line, one.layer === 0 ? '--ghost' : '--c0', dash));
+  if (place.textContent !== entries.map(one => one.text).join('')) place.replaceChildren(...entries.map(one => {
+    const item = document.createElement('span');
+    item.append(sampled(one), one.text);
     return item;
   }));
+}
+
+/** The sample of a line. @param {{ colour: string, dash: number[] }} style */
+function sampled(style) {
+  const line = document.createElement('canvas');
+  line.className = 'sample';
+  line.setAttribute('aria-hidden', 'true');
+  requestAnimationFrame(() => sample(line, style.colour, style.dash));
+  return line;
 }
 
 function wake() {
@@ -800,7 +808,7 @@ function toggleCursors() {
   cursors = cursors ? null : [1 / 3, 2 / 3];
   const place = element('cursors');
   place.hidden = !cursors;
-  element('measure').setAttribute('aria-pressed', String(!!cursors));
+  press(element('measure'), !!cursors);
   if (cursors) {
     place.replaceChildren(...cursors.map((part, i) => {
       const slider = document.createElement('input');
@@ -834,17 +842,11 @@ function measure() {
   const times = cursorTimes(), made = element('cursors').querySelector('table');
   if (!times || !made || times[0] >= times[1]) return;
   const [from, to] = times, table = document.createElement('table');
-  const head = table.createTHead().insertRow();
-  for (const name of [words.between(from, to), ...words.measures]) {
-    const cell = document.createElement('th');
-    cell.scope = 'col';
-    cell.textContent = name;
-    head.append(cell);
-  }
+  heads(table, [words.between(from, to), ...words.measures]);
   const body = table.createTBody(), curves = [];
-  for (const one of plots.filter(one => !one.plot.plane)) {
+  for (const one of overTime()) {
     for (const [curve, { x, y }] of one.curves) {
-      const { signal, case: at, layer } = parts(curve);
+      const { signal, layer } = parts(curve);
       if (layer !== baseLayer()) continue;
       curves.push(curve);
       const first = valueAt({ x, y }, from), last = valueAt({ x, y }, to);
@@ -856,7 +858,7 @@ function measure() {
       }
       const known = measured.get(curve), row = body.insertRow(), { label, unit } = hello.signals[signal];
       const [min, max, mean, rms, peak, period] = known ?? [low, high, NaN, NaN, high - low, NaN];
-      const name = [label, hello.cases[at], unit && `in ${unit}`].filter(Boolean).join(' '), copy = button(name, () => {
+      const name = titled(curve), copy = button(name, () => {
         void navigator.clipboard?.writeText(words.expect(label, `${number(peak ?? NaN, 5)} ${unit}`.trim(), from, to));
       });
       copy.setAttribute('aria-label', words.copyExpect(name));
@@ -880,7 +882,7 @@ function measure() {
 
 /** Asks for the points between the cursors, of all curves in the table. */
 function askCsv() {
-  const times = cursorTimes(), curves = plots.filter(one => !one.plot.plane).flatMap(one => [...one.curves.keys()]);
+  const times = cursorTimes(), curves = overTime().flatMap(one => [...one.curves.keys()]);
   const shown = [...new Set(curves.filter(curve => parts(curve).layer === baseLayer()))].slice(0, 64);
   if (times && shown.length) link.send(`csv ${questions += 1} ${times[0]} ${times[1]} ${shown.join(',')}`);
 }
@@ -909,14 +911,13 @@ function choice(name, of, act) {
 
 function toggleTrigger() {
   const place = element('trigger');
-  element('triggered').setAttribute('aria-pressed', String(!trigger));
+  press(element('triggered'), !trigger);
   place.hidden = !!trigger;
   if (trigger) {
     trigger = null;
     return wake();
   }
-  const shown = plots.filter(one => !one.plot.plane).flatMap(one => one.canvas.signals);
-  const name = (/** @type {number} */ signal) => `${hello.signals[signal].label} ${hello.signals[signal].unit && `in ${hello.signals[signal].unit}`}`.trim();
+  const shown = overTime().flatMap(one => one.canvas.signals);
   const level = document.createElement('input'), told = document.createElement('output');
   const rule = () => {
     const curve = baseLayer() * hello.cases.length * hello.signals.length + Number(signal.value);
@@ -926,7 +927,7 @@ function toggleTrigger() {
     told.textContent = words.waits;
     wake();
   };
-  const signal = choice(words.signal, shown.map(one => [String(one), name(one)]), rule), way = choice(words.way, words.ways, rule);
+  const signal = choice(words.signal, shown.map(one => [String(one), titled(one)]), rule), way = choice(words.way, words.ways, rule);
   const mode = choice(words.mode, words.modes, rule), part = choice(words.place, words.places, rule);
   mode.value = 'normal';
   level.type = 'text';
@@ -1006,20 +1007,23 @@ function tell() {
   if (!element('table').hidden) table();
 }
 
-/** Values at 21 instants of the window. */
-function table() {
-  const [from, to] = span(), rows = [], times = plots.filter(one => !one.plot.plane);
-  const columns = times.flatMap(one => [...one.curves].filter(([curve]) => parts(curve).layer === baseLayer()).map(([curve, points]) => ({ curve, points })));
-  const made = document.createElement('table'), head = made.createTHead().insertRow();
-  for (const name of [words.time, ...columns.map(({ curve }) => {
-    const { signal, case: at } = parts(curve), { label, unit } = hello.signals[signal];
-    return [label, hello.cases[at], unit && `in ${unit}`].filter(Boolean).join(' ');
-  })]) {
+/** The first row of a table. @param {HTMLTableElement} table @param {string[]} names */
+function heads(table, names) {
+  const row = table.createTHead().insertRow();
+  for (const name of names) {
     const cell = document.createElement('th');
     cell.scope = 'col';
     cell.textContent = name;
-    head.append(cell);
+    row.append(cell);
   }
+}
+
+/** Values at 21 instants of the window. */
+function table() {
+  const [from, to] = span(), rows = [], times = overTime();
+  const columns = times.flatMap(one => [...one.curves].filter(([curve]) => parts(curve).layer === baseLayer()).map(([curve, points]) => ({ curve, points })));
+  const made = document.createElement('table');
+  heads(made, [words.time, ...columns.map(({ curve }) => titled(curve))]);
   for (let i = 0; i <= 20; i++) rows.push(from + (to - from) * i / 20);
   const body = made.createTBody();
   for (const t of rows) {
@@ -1032,7 +1036,7 @@ function table() {
 function toggleTable() {
   const place = element('table');
   place.hidden = !place.hidden;
-  element('values').setAttribute('aria-pressed', String(!place.hidden));
+  press(element('values'), !place.hidden);
   if (!place.hidden) {
     table();
     place.focus();
@@ -1075,7 +1079,7 @@ function start() {
   shown.className = 'legend';
   const alone = button(words.free, () => {
     free = !free;
-    alone.setAttribute('aria-pressed', String(free));
+    press(alone, free);
     plots.forEach(one => { one.plot.moved = null; });
     legend();
     wake();
@@ -1114,7 +1118,7 @@ function start() {
   // A page that is silent does not operate.
   if (!saved) setInterval(() => { if (hello?.kind === 'rig') link.send('here'); }, 1000);
   new ResizeObserver(resize).observe(element('curves'));
-  matchMedia('(prefers-color-scheme: dark)').addEventListener('change', () => { plots.forEach(names); if (state) legend(); resize(); wake(); });
+  matchMedia('(prefers-color-scheme: dark)').addEventListener('change', () => { plots.forEach(names); element('legend').replaceChildren(); if (state) legend(); resize(); wake(); });
   addEventListener('beforeprint', () => { printing = true; resize(); draw(); });
   addEventListener('afterprint', () => { printing = false; });
 }

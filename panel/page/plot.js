@@ -43,6 +43,9 @@ const FADES = 8;
 /** On and off in the dashes of a moving line, pixels: they are counted from time 0 and so move with it. */
 const MOVING_DASH = [5, 4];
 
+/** @param {HTMLCanvasElement} canvas */
+const context2d = canvas => /** @type {CanvasRenderingContext2D} */ (canvas.getContext('2d'));
+
 export const COLOURS = ['--c0', '--c1', '--c2', '--c3'];
 export const DASHES = [[], [8, 4], [2, 3], [10, 3, 2, 3]];
 
@@ -54,7 +57,7 @@ export function sample(canvas, name, dash) {
   const ratio = devicePixelRatio;
   canvas.width = 24 * ratio;
   canvas.height = 8 * ratio;
-  const ctx = /** @type {CanvasRenderingContext2D} */ (canvas.getContext('2d'));
+  const ctx = context2d(canvas);
   ctx.scale(ratio, ratio);
   ctx.strokeStyle = colour(ctx, name);
   ctx.lineWidth = 2;
@@ -176,7 +179,7 @@ export class Plot {
     const by = moves && this.moved?.key === key ? n - this.moved.n : -1;
     this.moved = moves ? { n, key } : null;
     let from = LEFT;
-    const ctx = /** @type {CanvasRenderingContext2D} */ (this.curves.getContext('2d'));
+    const ctx = context2d(this.curves);
     ctx.save();
     if (by >= 0 && by < pixels) {
       const ratio = devicePixelRatio;
@@ -201,27 +204,13 @@ export class Plot {
     ctx.clip();
     ctx.lineJoin = 'round';
     for (const line of lines) {
-      ctx.strokeStyle = colour(ctx, line.colour);
-      ctx.lineWidth = line.ghost ? 1.3 : 1.6;
-      if (line.fades) {
-        this.fading(ctx, line);
-        continue;
+      const n = line.x.length;
+      // The older parts of a path are fainter.
+      for (let part = 0; line.fades && part < FADES; part++) {
+        ctx.globalAlpha = 0.2 + 0.8 * (part + 1) / FADES;
+        this.trace(ctx, line, Math.floor(n * part / FADES), Math.min(n, Math.floor(n * (part + 1) / FADES) + 1));
       }
-      const dashes = moves && line.dash.length > 0;
-      ctx.setLineDash(dashes ? [] : line.dash);
-      ctx.beginPath();
-      let pen = false, before = 0;
-      for (let i = from > LEFT ? Math.max(0, after(line.x, this.fromX(from)) - 2) : 0; i < line.x.length; i++) {
-        const y = line.y[i];
-        if (!Number.isFinite(y)) { pen = false; continue; }
-        if (dashes && (Math.floor(line.x[i] / each) % (MOVING_DASH[0] + MOVING_DASH[1])) >= MOVING_DASH[0]) { pen = false; continue; }
-        const px = this.atX(line.x[i]), py = this.atY(y);
-        if (!pen) ctx.moveTo(px, py);
-        else if (line.step) { ctx.lineTo(px, before); ctx.lineTo(px, py); } else ctx.lineTo(px, py);
-        pen = true;
-        before = py;
-      }
-      ctx.stroke();
+      if (!line.fades) this.trace(ctx, line, from > LEFT ? Math.max(0, after(line.x, this.fromX(from)) - 2) : 0, n, moves && line.dash.length ? each : 0);
     }
     ctx.restore();
     return { low, high };
@@ -229,7 +218,7 @@ export class Plot {
 
   /** @param {HTMLCanvasElement} canvas */
   context(canvas) {
-    const ctx = /** @type {CanvasRenderingContext2D} */ (canvas.getContext('2d'));
+    const ctx = context2d(canvas);
     ctx.setTransform(devicePixelRatio, 0, 0, devicePixelRatio, 0, 0);
     ctx.clearRect(0, 0, this.width, this.height);
     return ctx;
@@ -237,41 +226,32 @@ export class Plot {
 
   /** Lines that stand still while others move: below these, with the grid. @param {Line[]} lines */
   drawStill(lines) {
-    if (lines.length === 0) return;
-    const ctx = /** @type {CanvasRenderingContext2D} */ (this.grid.getContext('2d'));
+    const ctx = context2d(this.grid);
     ctx.save();
     ctx.beginPath();
     ctx.rect(LEFT, TOP, this.width - LEFT - RIGHT, this.height - TOP - BOTTOM);
     ctx.clip();
-    for (const line of lines) {
-      ctx.strokeStyle = colour(ctx, line.colour);
-      ctx.lineWidth = 1.3;
-      ctx.setLineDash(line.dash);
-      ctx.beginPath();
-      let pen = false;
-      line.x.forEach((x, i) => {
-        const px = this.atX(x + (line.by ?? 0)), py = this.atY(line.y[i]);
-        if (pen) ctx.lineTo(px, py); else if (Number.isFinite(py)) ctx.moveTo(px, py);
-        pen = Number.isFinite(py);
-      });
-      ctx.stroke();
-    }
+    for (const line of lines) this.trace(ctx, line, 0, line.x.length);
     ctx.restore();
   }
 
-  /** A path whose older parts are fainter. @param {CanvasRenderingContext2D} ctx @param {Line} line */
-  fading(ctx, line) {
-    const n = line.x.length;
-    ctx.setLineDash(line.dash);
-    for (let part = 0; part < FADES; part++) {
-      ctx.globalAlpha = 0.2 + 0.8 * (part + 1) / FADES;
-      ctx.beginPath();
-      for (let i = Math.floor(n * part / FADES); i < Math.min(n, Math.floor(n * (part + 1) / FADES) + 1); i++) {
-        if (Number.isFinite(line.y[i])) ctx.lineTo(this.atX(line.x[i]), this.atY(line.y[i]));
-      }
-      ctx.stroke();
+  /** Draws a part of a line. `each`: seconds a pixel of one that moves, whose dashes are counted by them. @param {CanvasRenderingContext2D} ctx @param {Line} line @param {number} first @param {number} last */
+  trace(ctx, line, first, last, each = 0) {
+    ctx.strokeStyle = colour(ctx, line.colour);
+    ctx.lineWidth = line.ghost ? 1.3 : 1.6;
+    ctx.setLineDash(each ? [] : line.dash);
+    ctx.beginPath();
+    let pen = false, before = 0;
+    for (let i = first; i < last; i++) {
+      const x = line.x[i], y = line.y[i];
+      if (!Number.isFinite(y) || each && Math.floor(x / each) % (MOVING_DASH[0] + MOVING_DASH[1]) >= MOVING_DASH[0]) { pen = false; continue; }
+      const px = this.atX(x + (line.by ?? 0)), py = this.atY(y);
+      if (pen && line.step) ctx.lineTo(px, before);
+      if (pen) ctx.lineTo(px, py); else ctx.moveTo(px, py);
+      pen = true;
+      before = py;
     }
-    ctx.globalAlpha = 1;
+    ctx.stroke();
   }
 
   drawGrid() {
@@ -363,7 +343,7 @@ export function bars(parent, late, period) {
   const box = parent.getBoundingClientRect(), ratio = devicePixelRatio;
   canvas.width = box.width * ratio;
   canvas.height = box.height * ratio;
-  const ctx = /** @type {CanvasRenderingContext2D} */ (canvas.getContext('2d'));
+  const ctx = context2d(canvas);
   ctx.scale(ratio, ratio);
   const most = Math.max(1, ...late.counts), last = Math.log10(late.edges[late.edges.length - 1]);
   const atX = (/** @type {number} */ us) => 6 + Math.log10(us) / last * (box.width - 12);

@@ -19,7 +19,7 @@ export const words = {
   asText: 'as the text',
   keep: (/** @type {string} */ letter) => `keep ${letter}`,
   go: (/** @type {string} */ letter) => `to ${letter}`,
-  drawn: ['as the text', '', 'A', 'B'],
+  drawn: 'as the text',
   set: 'These values for `fric run`, `fric sweep`, `fric hil`',
   ghost: (/** @type {string} */ letter) => `curves of ${letter}`,
   steady: 'steady curve of the contact',

@@ -139,7 +139,7 @@ fn contrast_is_enough_in_light_and_dark() {
         page.key("ArrowRight");
         assert_eq!(faint(&page), json!([]), "{scheme}");
     }
-    page.wait("new Promise(done => requestAnimationFrame(() => setTimeout(() => done(true), 100)))");
+    page.value("new Promise(done => requestAnimationFrame(() => setTimeout(() => done(true), 100)))");
     page.shot("what-if-dark");
     // The measure finds what it looks for.
     page.value("document.getElementById('title').style.color = '#333638'");
@@ -160,12 +160,12 @@ fn a_small_screen_needs_no_sideways_scrolling() {
     let page = open(&panel);
     page.size(390, 844);
     page.wait("innerWidth === 390");
-    page.wait("new Promise(done => requestAnimationFrame(() => setTimeout(() => done(true), 200)))");
+    page.value("new Promise(done => requestAnimationFrame(() => setTimeout(() => done(true), 200)))");
     page.shot("what-if-small");
     assert_eq!(page.value("document.documentElement.scrollWidth"), 390);
     assert_eq!(small(&page), json!([]));
     page.value("document.getElementById('knobs').scrollIntoView()");
-    page.wait("new Promise(done => requestAnimationFrame(() => setTimeout(() => done(true), 200)))");
+    page.value("new Promise(done => requestAnimationFrame(() => setTimeout(() => done(true), 200)))");
     page.shot("what-if-small-knobs");
 }
 
@@ -257,7 +257,7 @@ fn the_page_of_a_rig_is_for_everybody() {
     }
     page.size(390, 844);
     page.wait("innerWidth === 390");
-    page.wait("new Promise(done => requestAnimationFrame(() => setTimeout(() => done(true), 300)))");
+    page.value("new Promise(done => requestAnimationFrame(() => setTimeout(() => done(true), 300)))");
     assert_eq!(page.value("document.documentElement.scrollWidth"), 390);
     assert_eq!(small(&page), json!([]));
     page.size(1400, 900);

@@ -88,7 +88,7 @@ fn a_recording_is_looked_through() {
     assert!(anew < 0.05, "{anew} deg");
     page.value("document.getElementById('free').click()");
     page.wait("document.getElementById('legend').textContent.includes('from arming on')");
-    page.wait("new Promise(done => requestAnimationFrame(() => setTimeout(() => done(true), 300)))");
+    page.value("new Promise(done => requestAnimationFrame(() => setTimeout(() => done(true), 300)))");
     let free = differs(&page);
     println!("body.x differs by {anew} deg from the model anew each second, by {free} from that from arming on");
     assert!(free > anew, "{free} {anew}");
@@ -130,7 +130,7 @@ fn a_recording_is_looked_through() {
     page.value("document.querySelector('#happened button').click()");
     page.wait("!/, 0 s to /.test(document.querySelector('.plot canvas[role=img]').getAttribute('aria-label'))");
     page.media("prefers-color-scheme", "dark");
-    page.wait("new Promise(done => requestAnimationFrame(() => setTimeout(() => done(true), 200)))");
+    page.value("new Promise(done => requestAnimationFrame(() => setTimeout(() => done(true), 200)))");
     page.shot("recording-event-dark");
     // A recording obeys nobody, and needs no control for it.
     assert_eq!(page.value("document.getElementById('knobs').hidden"), json!(true));
