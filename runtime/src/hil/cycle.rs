@@ -142,6 +142,9 @@ pub struct Hil {
     cycle: trace::Cycle,
     signals: Vec<Signal>,
     words: Vec<u64>,
+    /// The commands that were handed to the log, for tests.
+    #[cfg(test)]
+    pub(super) commanded: Vec<Vec<u64>>,
     order: DriveCommand,
     overload: u32,
     first_trouble: Option<Trouble>,
@@ -209,6 +212,8 @@ impl Hil {
             cycle: trace::Cycle::new(empty),
             signals: Vec::new(),
             words: Vec::with_capacity(1 << 14),
+            #[cfg(test)]
+            commanded: Vec::new(),
             order: DriveCommand::Wait,
             overload: 0,
             first_trouble: None,
@@ -464,6 +469,8 @@ impl Hil {
             self.words.clear();
             trace::write_command(self.due_ns, command.name(), origin, &mut self.words);
             log.push(trace::COMMAND, &self.words);
+            #[cfg(test)]
+            self.commanded.push(self.words.clone());
         }
     }
 

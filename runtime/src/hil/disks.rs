@@ -262,12 +262,15 @@ fn run(script: &DiskScript) -> Result<Fate, String> {
     while hil.ended().is_none() {
         hil.cycle();
         disk.pass(hil.counts().all);
+        let commands = std::mem::take(&mut hil.commanded);
         let Some(control) = hil.control() else { continue };
         let mut note = |kind, write: &dyn Fn(&mut Vec<u64>)| {
             words.clear();
             write(&mut words);
             truth.push(Message { kind, words: words.clone() });
         };
+        // Commands stand before the cycle that has taken them.
+        commands.iter().for_each(|command| note(trace::COMMAND, &|words| words.extend_from_slice(command)));
         note(CYCLE, &|words| hil.last().write(words));
         note(trace::FRAMES, &|words| words.extend_from_slice(hil.last_frames()));
         let k = hil.last().k + 1;
