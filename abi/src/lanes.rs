@@ -249,17 +249,7 @@ impl Batch {
     /// lanes of one after the other. Time and count are none of them.
     pub fn advance_and_read(&mut self, pool: &[f64], n: u64, slots: &[Slot], rows: &mut Vec<f64>) -> u64 {
         rows.resize(n as usize * slots.len() * self.lanes.width, 0.0);
-        if let Some(code) = self.lanes.on_rows.clone().filter(|code| code.inputs.is_empty() && code.outputs == slots) {
-            return self.rows_by_code(&code, pool, &[], rows, n as usize) as u64;
-        }
-        for done in 0..n {
-            self.advance(pool, 1);
-            self.take(slots, &mut rows[done as usize * slots.len() * self.lanes.width..]);
-            if self.has_failed() {
-                return done + 1;
-            }
-        }
-        n
+        self.some_rows(pool, (&[], &[]), (slots, rows), n as usize) as u64
     }
 
     /// A fixed step of all lanes for each row of inputs, and a row of outputs after each. A row has a column for each slot, a
@@ -280,42 +270,42 @@ impl Batch {
         let width = self.lanes.width;
         assert_eq!(given.len(), rows * inputs.len() * width, "{rows} rows of inputs");
         assert_eq!(taken.len(), rows * outputs.len() * width, "{rows} rows of outputs");
-        let code = self.lanes.on_rows.clone();
-        if let Some(code) = code.filter(|code| code.inputs == inputs && code.outputs == outputs) {
-            return self.follow_by_code(&code, pool, given, taken, rows, failed);
-        }
-        for row in 0..rows {
-            self.give(inputs, &given[row * inputs.len() * width..]);
-            self.advance(pool, 1);
-            self.take(outputs, &mut taken[row * outputs.len() * width..]);
-            if self.has_failed() {
-                failed(row, self);
-            }
-        }
-    }
-
-    /// The same by the code for it.
-    fn follow_by_code(
-        &mut self,
-        code: &FollowLanes,
-        pool: &[f64],
-        given: &[f64],
-        taken: &mut [f64],
-        rows: usize,
-        failed: &mut dyn FnMut(usize, &Batch),
-    ) {
-        let (n, m) = (code.inputs.len() * self.lanes.width, code.outputs.len() * self.lanes.width);
+        let (n, m) = (inputs.len() * width, outputs.len() * width);
         let mut done = 0;
         while done < rows {
-            done += self.rows_by_code(code, pool, &given[done * n..], &mut taken[done * m..], rows - done);
+            let (from, to) = (&given[done * n..], &mut taken[done * m..]);
+            done += self.some_rows(pool, (inputs, from), (outputs, to), rows - done);
             if self.has_failed() {
                 failed(done - 1, self);
             }
         }
     }
 
-    /// Up to so many rows by the code for them, at least one, to the first at which the status of a lane is not 0; returns
-    /// their number.
+    /// Up to so many rows, at least one if there are any, to the first at which the status of a lane is not 0; returns their
+    /// number.
+    fn some_rows(
+        &mut self,
+        pool: &[f64],
+        (inputs, given): (&[Slot], &[f64]),
+        (outputs, taken): (&[Slot], &mut [f64]),
+        rows: usize,
+    ) -> usize {
+        let is_for_these = |code: &Arc<FollowLanes>| code.inputs == inputs && code.outputs == outputs;
+        if let Some(code) = self.lanes.on_rows.clone().filter(is_for_these) {
+            return self.rows_by_code(&code, pool, given, taken, rows);
+        }
+        for row in 0..rows {
+            self.give(inputs, &given[row * inputs.len() * self.lanes.width..]);
+            self.advance(pool, 1);
+            self.take(outputs, &mut taken[row * outputs.len() * self.lanes.width..]);
+            if self.has_failed() {
+                return row + 1;
+            }
+        }
+        rows
+    }
+
+    /// The same by the code for these rows.
     fn rows_by_code(
         &mut self,
         code: &FollowLanes,

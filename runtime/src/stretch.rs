@@ -69,6 +69,13 @@ impl Stretch {
     }
 }
 
+/// Copies one column of rows: every `stride`-th number of `rows`, which begin with the first of the column.
+pub(crate) fn copy_column(rows: &[f64], stride: usize, column: &mut [f64]) {
+    for (to, value) in column.iter_mut().zip(rows.iter().step_by(stride)) {
+        *to = *value;
+    }
+}
+
 /// The greatest `of` some finite values, −∞ of none.
 pub(crate) fn greatest(values: &[f64], of: impl Fn(f64) -> f64) -> f64 {
     reduced(values, f64::NEG_INFINITY, of, |most, value| if value > most { value } else { most })

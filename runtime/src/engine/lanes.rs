@@ -7,6 +7,7 @@ use crate::engine::{Failure, Outcome, bare, ended, failed, start};
 use crate::run::observe::{Observer, Probe};
 use crate::run::outcome::{Continue, Stop};
 use crate::run::stepper::{Rest, Stepper};
+use crate::stretch::copy_column;
 use abi::lanes::{Batch, Lanes};
 use abi::plan::Experiment;
 use abi::{Instance, Slot};
@@ -36,8 +37,7 @@ struct Series<'r> {
 impl Series<'_> {
     /// Writes the values of a slot in one lane after each of the first steps.
     fn read(&self, slot: usize, lane: usize, column: &mut [f64]) {
-        let values = self.rows[slot * self.width + lane..].iter().step_by(self.slots.len() * self.width);
-        column.iter_mut().zip(values).for_each(|(to, value)| *to = *value);
+        copy_column(&self.rows[slot * self.width + lane..], self.slots.len() * self.width, column);
     }
 }
 

@@ -162,7 +162,7 @@ pub struct Answer {
     pub followed: usize,
     /// Searches that ended where the best did.
     pub agreed: usize,
-    /// Where each search ended: −2 log-likelihood with white noise, but for a constant.
+    /// Where each search ended: −2 log-likelihood with white noise, up to a constant.
     pub ends: Vec<f64>,
     /// Number of runs, and how many of them failed for each cause.
     pub runs: u64,
@@ -321,7 +321,7 @@ fn paths(minima: Minima, order: usize) -> Vec<Vec<Way>> {
 struct Followed {
     end: End,
     noise: Vec<Noise>,
-    /// −2 log-likelihood, but for a constant.
+    /// −2 log-likelihood, up to a constant.
     misfit: f64,
 }
 

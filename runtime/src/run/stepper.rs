@@ -5,6 +5,7 @@
 
 use crate::run::observe::Observer;
 use crate::run::outcome::{Continue, Stop, Work};
+use crate::stretch::copy_column;
 use abi::{Function, Instance, Slot};
 use std::ops::Range;
 
@@ -18,8 +19,7 @@ pub(crate) trait Stepper {
     fn next(&mut self, watch: &mut dyn FnMut(f64) -> Continue) -> Result<Option<u64>, Stop>;
 
     /// If this run reads its block after every call: the slots that it reads, apart from time, and how many calls may be made
-    /// before [`take`](Stepper::take) if [`show`](Stepper::show) receives those slots after each call but the
-    /// last.
+    /// before [`take`](Stepper::take) if [`show`](Stepper::show) receives those slots after each call but the last.
     fn series(&self) -> Option<(&[Slot], u64)> {
         None
     }
@@ -86,10 +86,6 @@ fn in_series(course: &mut dyn Stepper, rows: &mut Vec<f64>) -> Result<Option<(u6
     let slots = slots.to_vec();
     rows.resize(most as usize * slots.len(), 0.0);
     let Some((done, status)) = course.instance().advance_recording(&slots, rows, most) else { return Ok(None) };
-    let column = |slot: usize, to: &mut [f64]| {
-        let values = rows[slot..].iter().step_by(slots.len());
-        to.iter_mut().zip(values).for_each(|(to, value)| *to = *value);
-    };
-    course.show(done - 1, &column)?;
+    course.show(done - 1, &|slot, column| copy_column(&rows[slot..], slots.len(), column))?;
     Ok(Some((done, status)))
 }
