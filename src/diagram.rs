@@ -4,7 +4,7 @@
 //! files.
 
 use crate::equations::expression;
-use grammar::ast::{BindValue, DeclarationKind, Expr, ExprKind, Model, Statement, Target};
+use grammar::ast::{self, BindValue, DeclarationKind, Expr, Model, Statement, Target};
 
 /// A part, or the environment of the model.
 struct DiagramBlock {
@@ -28,19 +28,13 @@ struct Diagram {
     wires: Vec<Wire>,
 }
 
-/// Paths in an expression.
-fn paths(expr: &Expr, out: &mut Vec<String>) {
-    match &expr.kind {
-        ExprKind::Path(path) => {
-            let names: Vec<&str> = path.segments.iter().map(|segment| segment.name.text.as_str()).collect();
-            out.push(names.join("."));
-        }
-        ExprKind::Call { args, .. } => args.iter().for_each(|arg| paths(arg, out)),
-        ExprKind::Unary(_, a) => paths(a, out),
-        ExprKind::Binary(_, _, a, b) => [a, b].into_iter().for_each(|one| paths(one, out)),
-        ExprKind::If(a, b, c) => [a, b, c].into_iter().for_each(|one| paths(one, out)),
-        ExprKind::Number { .. } | ExprKind::Derivative { .. } | ExprKind::Hole | ExprKind::Error => {}
-    }
+/// Paths in an expression, as text.
+fn paths(expr: &Expr) -> Vec<String> {
+    let text = |path: &ast::Path| {
+        let names: Vec<&str> = path.segments.iter().map(|segment| segment.name.text.as_str()).collect();
+        names.join(".")
+    };
+    expr.paths().into_iter().map(text).collect()
 }
 
 /// What a statement defines: its name, its value, and whether it is an output.
@@ -79,8 +73,7 @@ fn diagram(model: &Model) -> Diagram {
         let mut block = DiagramBlock { name: part.name.text.clone(), kind, inputs: Vec::new(), outputs: Vec::new() };
         for bind in &part.instance.args {
             let BindValue::Expr(value) = &bind.value else { continue };
-            let mut found = Vec::new();
-            paths(value, &mut found);
+            let found = paths(value);
             if found.is_empty() {
                 continue; // A number is a parameter.
             }
@@ -94,8 +87,7 @@ fn diagram(model: &Model) -> Diagram {
     let mut leaving =
         DiagramBlock { name: String::new(), kind: String::new(), inputs: Vec::new(), outputs: Vec::new() };
     for (name, value, output) in model.body.iter().filter_map(computed) {
-        let mut found = Vec::new();
-        paths(value, &mut found);
+        let found = paths(value);
         let of_a_part = |path: &String| {
             let head = path.split_once('.').map(|(head, _)| head);
             head.is_some_and(|head| blocks.iter().any(|block| block.name == head))

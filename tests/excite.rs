@@ -75,8 +75,8 @@ fn a_motion_keeps_its_limits() {
     }
 }
 
-/// Simulated recordings of a designed motion give the standard deviations that were promised to 15 %, and the true values
-/// within four of them; those of a sine are larger.
+/// Fits of simulated recordings of a designed motion have the predicted standard deviations within 15 %, and the true values
+/// lie within four standard deviations. A sine predicts larger ones.
 #[test]
 fn a_fit_is_as_exact_as_was_promised() {
     let folder = folder("promise");

@@ -214,7 +214,7 @@ fn units_joined_have_the_bytes_of_one_machine() {
         }
         assert!((0..total as usize).all(|k| missing[k] != others(k)), "{units:?} without {left_out}: {out}");
     }
-    // A dataset has the same files, whoever makes it.
+    // A dataset has the same files, whether one machine writes it or a join of units.
     for (options, joined) in joined_sets {
         let folder = folder("set");
         texts(&folder);

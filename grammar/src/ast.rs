@@ -320,6 +320,20 @@ pub struct Instance {
     pub span: Span,
 }
 
+impl Instance {
+    /// The paths in the values of its arguments and of those of instances in it, in the order of the text.
+    pub fn paths(&self) -> Vec<&Path> {
+        let mut all = Vec::new();
+        for bind in &self.args {
+            all.extend(match &bind.value {
+                BindValue::Expr(expr) => expr.paths(),
+                BindValue::Instance(instance) => instance.paths(),
+            });
+        }
+        all
+    }
+}
+
 /// One argument of an instance: `v = body.v`, `fr = LuGre()`, `ctl.Kx = 10 1/s`.
 #[derive(Clone, PartialEq, Debug)]
 #[allow(missing_docs)]
@@ -858,6 +872,14 @@ impl Path {
             _ => None,
         }
     }
+
+    /// The column of a recording that it names: `x` of `data.x`.
+    pub fn column(&self) -> Option<&Name> {
+        match self.segments.as_slice() {
+            [data, column, ..] if data.name.text == "data" => Some(&column.name),
+            _ => None,
+        }
+    }
 }
 
 /// An expression and its span.
@@ -867,6 +889,20 @@ pub struct Expr {
     pub kind: ExprKind,
     /// Span without surrounding parentheses.
     pub span: Span,
+}
+
+impl Expr {
+    /// The paths in it, in the order of the text; without those in the windows of measures.
+    pub fn paths(&self) -> Vec<&Path> {
+        match &self.kind {
+            ExprKind::Path(path) => vec![path],
+            ExprKind::Call { args, .. } => args.iter().flat_map(Expr::paths).collect(),
+            ExprKind::Unary(_, a) => a.paths(),
+            ExprKind::Binary(_, _, a, b) => [a, b].into_iter().flat_map(|one| one.paths()).collect(),
+            ExprKind::If(a, b, c) => [a, b, c].into_iter().flat_map(|one| one.paths()).collect(),
+            ExprKind::Number { .. } | ExprKind::Derivative { .. } | ExprKind::Hole | ExprKind::Error => Vec::new(),
+        }
+    }
 }
 
 /// The kinds of expression.

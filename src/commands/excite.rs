@@ -12,13 +12,14 @@ use crate::project;
 use crate::quantity::{self, count, duration, show, significant};
 use crate::terminal::{Style, Terminal};
 use abi::unit::Unit;
-use grammar::ast::{self, BindValue, ExperimentStatement, Expr, ExprKind, FitStatement};
+use grammar::ast::{self, ExperimentStatement, Expr, FitStatement};
 use runtime::fit::cma_es::{self, Search};
 use runtime::fit::information::Information;
 use runtime::fit::unknowns::Scale;
 use runtime::fit::{Elementary, Unknown, Way};
 use runtime::rng::Chance;
 use serde_json::{Value, json};
+use std::collections::BTreeSet;
 use std::f64::consts::PI;
 use std::fmt::Write as _;
 use std::path::Path;
@@ -135,7 +136,7 @@ impl Series {
         );
     }
 
-    /// The sums of a series and of its derivatives as expressions of a time and of the lowest circular frequency.
+    /// The sums of a series and of its derivatives as expressions of a time and of the angular frequency of its fundamental.
     fn sums(&self, coefficients: &[String], t: &str, w: &str) -> [String; 3] {
         let h = self.harmonics;
         let of = |order: u32| {
@@ -456,9 +457,7 @@ fn moves(loaded: &Loaded, fit: &ast::Fit, limits: &[Limit]) -> Result<Moves, Str
         FitStatement::Experiment(ExperimentStatement::Run(run)) => Some(run),
         _ => None,
     });
-    let mut read = run.map_or_else(Vec::new, |run| reads(&run.instance));
-    read.sort_unstable();
-    read.dedup();
+    let read = columns_of(run.into_iter().flat_map(|run| run.instance.paths()));
     let is_motion = |column: &String| MOTION.iter().any(|(name, _)| name == column);
     let moves = match &read[..] {
         [] => {
@@ -509,29 +508,10 @@ fn moves(loaded: &Loaded, fit: &ast::Fit, limits: &[Limit]) -> Result<Moves, Str
     Ok(moves)
 }
 
-/// The columns of the recording that an instance reads.
-fn reads(instance: &ast::Instance) -> Vec<String> {
-    let of = |bind: &ast::Bind| match &bind.value {
-        BindValue::Expr(expr) => read_by(expr).into_iter().map(|path| path.segments[1].name.text.clone()).collect(),
-        BindValue::Instance(instance) => reads(instance),
-    };
-    instance.args.iter().flat_map(of).collect()
-}
-
-/// The paths `data.NAME` in an expression.
-fn read_by(expr: &Expr) -> Vec<&ast::Path> {
-    match &expr.kind {
-        ExprKind::Path(path) if path.segments.len() > 1 && path.segments[0].name.text == "data" => vec![path],
-        ExprKind::Call { args, .. } => args.iter().flat_map(read_by).collect(),
-        ExprKind::Unary(_, a) => read_by(a),
-        ExprKind::Binary(_, _, a, b) => [a, b].into_iter().flat_map(|one| read_by(one)).collect(),
-        ExprKind::If(a, b, c) => [a, b, c].into_iter().flat_map(|one| read_by(one)).collect(),
-        ExprKind::Number { .. }
-        | ExprKind::Path(_)
-        | ExprKind::Derivative { .. }
-        | ExprKind::Hole
-        | ExprKind::Error => Vec::new(),
-    }
+/// The columns of the recording that these paths name, sorted.
+fn columns_of<'a>(paths: impl IntoIterator<Item = &'a ast::Path>) -> Vec<String> {
+    let names = paths.into_iter().filter_map(|path| Some(path.column()?.text.clone()));
+    names.collect::<BTreeSet<String>>().into_iter().collect()
 }
 
 /// All named columns of a fit but the time, with their units as written.
@@ -555,11 +535,7 @@ fn compared_columns(fit: &ast::Fit) -> Vec<String> {
         FitStatement::Minimise(minimise) => Some(&minimise.items),
         _ => None,
     });
-    let mut read: Vec<String> =
-        compared.into_iter().flatten().flat_map(read_by).map(|path| path.segments[1].name.text.clone()).collect();
-    read.sort_unstable();
-    read.dedup();
-    read
+    columns_of(compared.into_iter().flatten().flat_map(Expr::paths))
 }
 
 /// The columns that are compared, with their units: those of the file whose units are written.
@@ -587,13 +563,13 @@ fn text(
     for statement in &fit.body {
         match statement {
             FitStatement::Experiment(ExperimentStatement::Run(run)) => {
-                let mut paths = Vec::new();
-                collect(&run.instance, &mut paths);
+                let mut columns: Vec<(&ast::Path, &ast::Name)> =
+                    run.instance.paths().into_iter().filter_map(|path| Some((path, path.column()?))).collect();
                 let begin = run.instance.span.start;
                 let mut instance = slice(run.instance.span).to_string();
-                paths.sort_by_key(|path: &&ast::Path| std::cmp::Reverse(path.span.start));
-                for path in paths {
-                    let order = moves.order(&path.segments[1].name.text).expect("it is part of the motion");
+                columns.sort_by_key(|(path, _)| std::cmp::Reverse(path.span.start));
+                for (path, column) in columns {
+                    let order = moves.order(&column.text).expect("it is part of the motion");
                     let call = format!("excite_{order}(t, {})", coefficients.join(", "));
                     let at = (path.span.start - begin) as usize..(path.span.end - begin) as usize;
                     instance.replace_range(at, &call);
@@ -643,15 +619,6 @@ fn text(
     series.text(&mut functions, &coefficients, &arguments, &unit);
     let (from, to) = (fit.span.start as usize, fit.span.end as usize);
     Ok(format!("{}{body}{}\n{functions}", &whole[..from], &whole[to..]))
-}
-
-fn collect<'a>(instance: &'a ast::Instance, paths: &mut Vec<&'a ast::Path>) {
-    for bind in &instance.args {
-        match &bind.value {
-            BindValue::Expr(expr) => paths.extend(read_by(expr)),
-            BindValue::Instance(instance) => collect(instance, paths),
-        }
-    }
 }
 
 /// Values of a fit so far, from its JSON.

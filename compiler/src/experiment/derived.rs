@@ -48,7 +48,11 @@ pub fn derive(
     let mut waiting: Vec<&ast::Derived> = definitions.to_vec();
     while !waiting.is_empty() {
         let is_ready = |one: &ast::Derived| {
-            !read(&one.value).iter().any(|name| waiting.iter().any(|other| other.name.text == name.text))
+            !one.value
+                .paths()
+                .iter()
+                .filter_map(|path| path.column())
+                .any(|name| waiting.iter().any(|other| other.name.text == name.text))
         };
         let Some(at) = waiting.iter().position(|one| is_ready(one)) else {
             let mut error = Diagnostic::error("E0903", "columns are computed from each other");
@@ -79,24 +83,6 @@ fn column(name: &str, x: Vec<f64>, y: Vec<f64>, unit: Unit) -> (String, Table, U
     let x_unit = Unit::si(Dimension::of([0, 0, 1, 0, 0]));
     let table = Table { name: format!("data.{name}"), x_unit, y_unit: unit.clone(), smooth: false, held: false, x, y };
     (name.to_string(), table, unit)
-}
-
-/// The columns that an expression reads.
-fn read(expr: &Expr) -> Vec<&ast::Name> {
-    match &expr.kind {
-        ExprKind::Path(path) if path.segments.len() > 1 && path.segments[0].name.text == "data" => {
-            vec![&path.segments[1].name]
-        }
-        ExprKind::Call { args, .. } => args.iter().flat_map(read).collect(),
-        ExprKind::Unary(_, a) => read(a),
-        ExprKind::Binary(_, _, a, b) => [a, b].into_iter().flat_map(|one| read(one)).collect(),
-        ExprKind::If(a, b, c) => [a, b, c].into_iter().flat_map(|one| read(one)).collect(),
-        ExprKind::Number { .. }
-        | ExprKind::Path(_)
-        | ExprKind::Derivative { .. }
-        | ExprKind::Hole
-        | ExprKind::Error => Vec::new(),
-    }
 }
 
 /// The computation of one column.

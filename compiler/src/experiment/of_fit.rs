@@ -149,7 +149,9 @@ pub fn own_unknowns(fit: &ast::Fit) -> Vec<&ast::Vary> {
     });
     let is_own = |vary: &&ast::Vary| {
         let name = vary.path.single().filter(|_| !vary.initial);
-        name.is_some_and(|name| mentions(run, &|path| path.single().is_some_and(|other| other.text == name.text)))
+        name.is_some_and(|name| {
+            run.paths().iter().any(|path| path.single().is_some_and(|other| other.text == name.text))
+        })
     };
     all.filter(is_own).collect()
 }
@@ -233,26 +235,7 @@ pub fn sides(of: &Expr) -> Option<[&Expr; 2]> {
 
 /// Whether an argument of an instance, or of an instance in it, reads the recording.
 pub fn reads_recording(instance: &ast::Instance) -> bool {
-    mentions(instance, &|path| path.segments.len() > 1 && path.segments[0].name.text == "data")
-}
-
-/// Whether an argument of an instance, or of an instance in it, contains such a path.
-fn mentions(instance: &ast::Instance, is: &dyn Fn(&ast::Path) -> bool) -> bool {
-    instance.args.iter().any(|bind| match &bind.value {
-        ast::BindValue::Expr(expr) => contains(expr, is),
-        ast::BindValue::Instance(instance) => mentions(instance, is),
-    })
-}
-
-fn contains(expr: &Expr, is: &dyn Fn(&ast::Path) -> bool) -> bool {
-    match &expr.kind {
-        ExprKind::Path(path) => is(path),
-        ExprKind::Call { args, .. } => args.iter().any(|a| contains(a, is)),
-        ExprKind::Unary(_, a) => contains(a, is),
-        ExprKind::Binary(_, _, a, b) => contains(a, is) || contains(b, is),
-        ExprKind::If(a, b, c) => contains(a, is) || contains(b, is) || contains(c, is),
-        ExprKind::Number { .. } | ExprKind::Derivative { .. } | ExprKind::Hole | ExprKind::Error => false,
-    }
+    instance.paths().iter().any(|path| path.column().is_some())
 }
 
 /// The interval of rows in s, if all have the same to a thousandth of it.

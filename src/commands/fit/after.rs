@@ -173,7 +173,7 @@ pub struct Profile {
     pub ends: (Option<f64>, Option<f64>),
 }
 
-/// −2 log-likelihood under a model of the noise, but for a constant.
+/// −2 log-likelihood under a model of the noise, up to a constant.
 pub fn misfit(runs: &Runs, (noise, residuals): (&[Noise], &Residuals), values: &[f64]) -> f64 {
     let items = runs.parts.iter().flat_map(|part| &part.asks.items);
     let of = |(k, item): (usize, &crate::compile::FitItem)| {

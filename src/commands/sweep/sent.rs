@@ -45,7 +45,7 @@ impl Sent {
         self.table.total()
     }
 
-    /// Titles of the columns, each with whether it holds `numbers`, `integers`, `booleans` or `words`.
+    /// The title of each column and the type of its values: `numbers`, `integers`, `booleans` or `words`.
     pub fn columns(&self) -> Vec<(String, &'static str)> {
         let word = |holds| match holds {
             Holds::Numbers => "numbers",

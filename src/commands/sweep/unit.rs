@@ -212,7 +212,7 @@ pub struct Cover {
     pub taken: Vec<(usize, Range<u64>)>,
     /// Runs that are in none.
     pub missing: Vec<Range<u64>>,
-    /// Two units with the same runs and different rows.
+    /// Numbers of two units that contain the same runs with different rows, if there are such: one of them is wrong.
     pub at_odds: Option<(usize, usize)>,
 }
 
