@@ -421,10 +421,46 @@ pub struct Test {
 }
 
 /// Options that a plan contains.
-const PLANNED: [&str; 11] =
-    ["vary", "best", "runs", "seed", "all", "solver", "step", "tol", "duration", "shard", "resume"];
+const PLANNED: [&str; 12] =
+    ["keep", "vary", "best", "runs", "seed", "all", "solver", "step", "tol", "duration", "shard", "resume"];
 /// Options of a sweep that runs.
 const RUNNING: [&str; 9] = ["out", "resume", "shard", "threads", "plot", "no_error", "interpret", "unit", "join"];
+
+/// What a sweep keeps of its runs.
+#[derive(Clone, Copy, PartialEq, Eq, Debug, Default, clap::ValueEnum)]
+pub enum Keep {
+    /// A row for each run
+    #[default]
+    Rows,
+    /// For each point of the grids and each measure: mean, deviation, quantiles, a histogram, the outermost rows
+    Summary,
+    /// The table, and beside it the statistics as .json
+    Both,
+}
+
+impl Keep {
+    /// Whether there is a table.
+    pub fn rows(self) -> bool {
+        self != Keep::Summary
+    }
+
+    /// Whether there are statistics.
+    pub fn statistics(self) -> bool {
+        self != Keep::Rows
+    }
+
+    /// Its name as it is typed.
+    pub fn name(self) -> &'static str {
+        match self {
+            Keep::Rows => "rows",
+            Keep::Summary => "summary",
+            Keep::Both => "both",
+        }
+    }
+
+    /// All of them.
+    pub const ALL: [Keep; 3] = [Keep::Rows, Keep::Summary, Keep::Both];
+}
 
 /// `fric sweep`
 #[derive(clap::Args, Debug)]
@@ -450,9 +486,12 @@ pub struct Sweep {
     #[arg(long, value_name = "NUMBER")]
     pub seed: Option<u64>,
     /// The table to write: .csv or .parquet; without ending a dataset, a folder of Parquet files; with --unit any name
-    /// [default: sweep.csv, with --unit runs-A-B.fricunit]
+    /// [default: sweep.csv, with --keep summary sweep.json, with --unit runs-A-B.fricunit]
     #[arg(long, short, value_name = "FILE", value_hint = ValueHint::FilePath)]
     pub out: Option<PathBuf>,
+    /// What is kept: the rows; or statistics alone, as .json, for more runs than a disk holds; or both
+    #[arg(long, value_name = "WHAT", value_enum)]
+    pub keep: Option<Keep>,
     /// Continue an unfinished table
     #[arg(long)]
     pub resume: bool,

@@ -3,6 +3,7 @@
 //! In: a text and its name. Out: runs with the results of `fric run --json`, programs of models, reports on mistakes as
 //! strings. Files that a text names are read once, so that the text can be sent elsewhere together with them.
 
+pub use crate::args::Keep;
 use crate::characterise::subject::Written;
 use crate::characterise::{Extent, page, study};
 use crate::commands::sweep::{self, SweepFault, SweepRequest};
@@ -264,7 +265,8 @@ impl Text {
         Ok(cases.into_iter().zip(results).map(run).collect())
     }
 
-    /// The plan of a sweep of an experiment, as bytes that [`Sweep`] reads, here and elsewhere. `vary`: as for `--vary`.
+    /// The plan of a sweep of an experiment, as bytes that [`Sweep`] reads, here and elsewhere. `vary`: as for `--vary`;
+    /// `runs`, `seed` and `keep` likewise.
     ///
     /// # Errors
     /// The errors of the experiment and of what varies.
@@ -273,8 +275,8 @@ impl Text {
         experiment: &str,
         vary: &[String],
         changes: &Changes,
-        runs: Option<u64>,
-        seed: Option<u64>,
+        (runs, seed): (Option<u64>, Option<u64>),
+        keep: Keep,
     ) -> Result<Vec<u8>, Problems> {
         let mut loaded = self.loaded.clone();
         let wrong = |report: String| Problems { report, ..Problems::of(&self.loaded, &[]) };
@@ -290,6 +292,7 @@ impl Text {
             duration,
             runs,
             seed,
+            keep,
             ..SweepRequest::default()
         };
         let (method, bytes) = sweep::planned(request, &mut loaded, &self.sources).map_err(|fault| match fault {

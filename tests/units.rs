@@ -4,6 +4,7 @@
 mod support;
 
 use runtime::rng::Chance;
+use serde_json::Value;
 use std::fs;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
@@ -87,8 +88,8 @@ fn texts(folder: &Path) {
     fs::write(folder.join("push.csv"), "t [s];u [N]\n0;0\n0.3;2\n0.6;-1\n1;0\n").unwrap();
 }
 
-/// The options of a random sweep: an experiment, what varies, how often it is drawn, and what is set.
-fn random_sweep(chance: &mut Chance) -> Vec<String> {
+/// The options of a random sweep: an experiment, what varies, how often it is drawn, at most so often, and what is set.
+fn random_sweep(chance: &mut Chance, most: u64) -> Vec<String> {
     let experiment = ["fixed", "adaptive", "cases", "recorded"][chance.below(4) as usize];
     let mut options = vec![experiment.to_string()];
     let mut drawn = false;
@@ -106,7 +107,7 @@ fn random_sweep(chance: &mut Chance) -> Vec<String> {
         options.extend(["--vary".into(), "k, k2 = 5 N/m, 20 N/m, 85 N/m".into()]);
     }
     if drawn {
-        options.extend(["--runs".into(), (1 + chance.below(40)).to_string(), "--seed".into()]);
+        options.extend(["--runs".into(), (1 + chance.below(most)).to_string(), "--seed".into()]);
         options.push(chance.below(1000).to_string());
     }
     if chance.below(4) == 0 {
@@ -156,7 +157,7 @@ fn units_joined_have_the_bytes_of_one_machine() {
         let mut chance = Chance(seed.wrapping_mul(1000) + k);
         let folder = folder(&format!("generated-{k}"));
         texts(&folder);
-        let options = random_sweep(&mut chance);
+        let options = random_sweep(&mut chance, 40);
         println!("seed {seed}, sweep {k}: {options:?}");
         let options: Vec<&str> = options.iter().map(String::as_str).collect();
         let sweep = |more: &[&'static str]| [&["sweep", "spring.fric"], &options[..], more].concat();
@@ -376,6 +377,215 @@ fn a_table_changes_between_machines_half_way() {
     let (_, err) = run(&folder, &["sweep", "--join", "q", "v", "--out", "t.csv", "-q"], 1);
     assert!(err.contains("holds a sweep that is not finished"), "{err}");
     assert!(fs::read(folder.join("t.csv")).unwrap() == one);
+}
+
+/// The cells of a table, without its head, and the head.
+fn cells(table: &Path) -> (Vec<String>, Vec<Vec<String>>) {
+    let mut reader = csv::Reader::from_path(table).unwrap();
+    let head = reader.headers().unwrap().iter().map(str::to_string).collect();
+    let rows = reader.records().map(|row| row.unwrap().iter().map(str::to_string).collect()).collect();
+    (head, rows)
+}
+
+/// Whether a number was written as this one. The reader may be wrong in the last bit.
+fn near(value: &Value, number: f64) -> bool {
+    value.as_f64().is_some_and(|value| (value - number).abs() <= 2.0 * f64::EPSILON * number.abs())
+}
+
+/// Statistics against the rows that they are of, computed anew. Returns how many quantiles were compared.
+fn are_those_of_the_rows(statistics: &[u8], table: &Path) -> usize {
+    let (head, rows) = cells(table);
+    let found: Value = serde_json::from_slice(statistics).unwrap();
+    let titles: Vec<&str> = found["columns"].as_array().unwrap().iter().map(|title| title.as_str().unwrap()).collect();
+    assert_eq!(titles, head.iter().map(String::as_str).collect::<Vec<_>>());
+    let (mut first, mut compared) = (0, 0);
+    let status = head.len() - 1;
+    for group in found["groups"].as_array().unwrap() {
+        let size = group["runs"].as_u64().unwrap() as usize;
+        let own = &rows[first..first + size];
+        first += size;
+        for (title, value) in group["point"].as_object().unwrap() {
+            let k = head.iter().position(|other| other == title).unwrap();
+            let same = |row: &Vec<String>| match value {
+                Value::String(label) => row[k] == *label,
+                value => near(value, row[k].parse().unwrap()),
+            };
+            assert!(own.iter().all(same), "{title} {value}");
+        }
+        let ended = group["ended"].as_array().unwrap();
+        let all: u64 = ended.iter().map(|one| one["runs"].as_u64().unwrap()).sum();
+        assert_eq!(all as usize, size);
+        for one in ended {
+            let run = one["first"].as_u64().unwrap() as usize;
+            assert_eq!(rows[run][status], one["status"].as_str().unwrap());
+        }
+        let well = own.iter().filter(|row| row[status] == "ok").count() as u64;
+        assert_eq!(ended.iter().find(|one| one["status"] == "ok").map_or(0, |one| one["runs"].as_u64().unwrap()), well);
+        for (title, verdict) in group["verdicts"].as_object().unwrap() {
+            let k = head.iter().position(|other| other == title).unwrap();
+            let of = |wanted: &str| own.iter().filter(|row| row[k] == wanted).count() as u64;
+            assert_eq!(verdict["held"], of("true"), "{title}");
+            assert_eq!(verdict["judged"], of("true") + of("false"), "{title}");
+        }
+        for (title, measure) in group["measures"].as_object().unwrap() {
+            let k = head.iter().position(|other| other == title).unwrap();
+            let mut values: Vec<(f64, u64)> =
+                own.iter().filter_map(|row| Some((row[k].parse().ok()?, row[0].parse().unwrap()))).collect();
+            assert_eq!(measure["number"], values.len(), "{title}");
+            assert_eq!(measure["missing"], size - values.len(), "{title}");
+            values.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+            let Some(least) = values.first() else {
+                assert!(
+                    measure["mean"].is_null() && measure["least"].is_null() && measure["quantiles"]["50 %"].is_null()
+                );
+                continue;
+            };
+            assert!(near(&measure["least"]["value"], least.0), "{title}");
+            assert_eq!(measure["least"]["run"], least.1, "{title}");
+            let lowest: Vec<u64> = values.iter().take(16).map(|value| value.1).collect();
+            let kept: Vec<u64> =
+                measure["lowest"].as_array().unwrap().iter().map(|row| row[0].as_u64().unwrap()).collect();
+            assert_eq!(kept, lowest, "{title}");
+            for row in measure["highest"].as_array().unwrap() {
+                let run = row[0].as_u64().unwrap() as usize;
+                let same = |(cell, text): (&Value, &String)| match cell {
+                    Value::Null => text.is_empty(),
+                    Value::String(cell) => cell == text,
+                    Value::Bool(cell) => cell.to_string() == *text,
+                    cell => near(cell, text.parse().unwrap()),
+                };
+                assert!(row.as_array().unwrap().iter().zip(&rows[run]).all(same), "{row} {:?}", rows[run]);
+            }
+            let number = values.len() as f64;
+            let mean = values.iter().map(|value| value.0).sum::<f64>() / number;
+            let square: f64 = values.iter().map(|value| (value.0 - mean) * (value.0 - mean)).sum();
+            let deviation = (square / (number.max(2.0) - 1.0)).sqrt();
+            let scale = values.iter().fold(0.0, |most: f64, value| most.max(value.0.abs()));
+            assert!((measure["mean"].as_f64().unwrap() - mean).abs() <= 1e-12 * scale, "{title}");
+            assert!((measure["deviation"].as_f64().unwrap() - deviation).abs() <= 1e-9 * scale, "{title}");
+            let bins = measure["histogram"].as_array().unwrap();
+            let within = |bin: &Value| {
+                let inside = |x: f64| {
+                    let [low, high] = [0, 1].map(|k| bin[k].as_f64().unwrap());
+                    (low <= x || near(&bin[0], x)) && (x <= high || near(&bin[1], x))
+                };
+                values.iter().filter(|value| inside(value.0)).count() as u64 >= bin[2].as_u64().unwrap()
+            };
+            assert!(bins.iter().all(within), "{title}");
+            for (percent, quantile) in measure["quantiles"].as_object().unwrap() {
+                let part: f64 = percent.strip_suffix(" %").unwrap().parse().unwrap();
+                let exact = values[(part / 100.0 * (number - 1.0)).round() as usize].0;
+                let found = quantile.as_f64().unwrap();
+                assert!((found - exact).abs() <= 1e-3 * exact.abs(), "{title} {percent}: {found} for {exact}");
+                compared += 1;
+            }
+        }
+    }
+    assert_eq!(first, rows.len());
+    compared
+}
+
+/// Statistics alone, beside a table of each kind, from units in any order, and after a kill: one file, and what the rows
+/// say.
+#[test]
+fn statistics_have_the_same_bytes_however_they_are_made() {
+    let seed = number("FRIC_SEED").unwrap_or(1);
+    let (mut compared, mut resumed, mut blocks_made) = (0, 0, 0);
+    for k in 0..number("FRIC_RUNS").unwrap_or(10) {
+        let mut chance = Chance(seed.wrapping_mul(3000) + k);
+        let folder = folder(&format!("statistics-{k}"));
+        texts(&folder);
+        let mut options = random_sweep(&mut chance, 700);
+        if let Some(at) = options.iter().position(|option| option == "--best") {
+            options.drain(at..at + 2);
+        }
+        println!("seed {seed}, sweep {k}: {options:?}");
+        let options: Vec<&str> = options.iter().map(String::as_str).collect();
+        let sweep = |more: &[&'static str]| [&["sweep", "spring.fric", "-q"], &options[..], more].concat();
+        run(&folder, &sweep(&["--keep", "both", "--threads", "1", "--out", "rows.csv"]), 0);
+        run(&folder, &sweep(&["--out", "plain.csv"]), 0);
+        assert!(fs::read(folder.join("plain.csv")).unwrap() == fs::read(folder.join("rows.csv")).unwrap());
+        let one = fs::read(folder.join("rows.json")).unwrap();
+        compared += are_those_of_the_rows(&one, &folder.join("rows.csv"));
+        run(&folder, &sweep(&["--keep", "summary", "--threads", "3"]), 0);
+        assert!(fs::read(folder.join("sweep.json")).unwrap() == one, "alone: {options:?}");
+        assert!(!folder.join(".sweep.json.blocks").exists() && !folder.join(".sweep.json.unfinished").exists());
+        let also = if k % 2 == 0 { "also.parquet" } else { "also" };
+        run(&folder, &sweep(&["--keep", "both", "--out", also]), 0);
+        assert!(fs::read(folder.join("also.json")).unwrap() == one, "beside {also}: {options:?}");
+        let mut child =
+            fric(&folder, &sweep(&["--keep", "summary", "--threads", "1", "--out", "killed.json"])).spawn().unwrap();
+        std::thread::sleep(Duration::from_micros(chance.below(150_000)));
+        child.kill().unwrap();
+        child.wait().unwrap();
+        let begun = folder.join(".killed.json.unfinished").exists();
+        resumed += usize::from(begun);
+        let how: &[&'static str] = if begun { &["--resume"] } else { &[] };
+        run(&folder, &sweep(&[&["--keep", "summary", "--out", "killed.json"], how].concat()), 0);
+        assert!(fs::read(folder.join("killed.json")).unwrap() == one, "resumed: {options:?}");
+        // Units count blocks.
+        run(&folder, &sweep(&["--keep", "summary", "--plan", "p.fricjob"]), 0);
+        let (all, _) = run(&folder, &["sweep", "--join", "p.fricjob", "--missing"], 0);
+        let blocks = all.trim().strip_prefix("0..").unwrap().parse().unwrap();
+        blocks_made += blocks;
+        let units = random_units(&mut chance, blocks);
+        let names: Vec<String> = (0..units.len()).map(|k| format!("{k}.fricunit")).collect();
+        for (unit, name) in units.iter().zip(&names) {
+            let threads = (1 + chance.below(3)).to_string();
+            let mut args = vec!["sweep", "--unit"];
+            let of = format!("{}..{}", unit.start, unit.end);
+            args.extend([of.as_str(), "p.fricjob", "-o", name, "-q", "--threads", &threads]);
+            args.extend((chance.below(3) == 0).then_some("--interpret"));
+            run(&folder, &args, 0);
+        }
+        let names: Vec<&str> = names.iter().map(String::as_str).collect();
+        run(&folder, &[&["sweep", "--join", "p.fricjob", "-q", "-o", "joined.json"], &names[..]].concat(), 0);
+        assert!(fs::read(folder.join("joined.json")).unwrap() == one, "{options:?} {units:?}");
+    }
+    println!("{compared} quantiles, {blocks_made} blocks, {resumed} sweeps resumed");
+    assert!(compared > 100 && blocks_made > 20);
+}
+
+#[test]
+fn what_statistics_cannot_do_is_refused() {
+    let folder = folder("statistics-refused");
+    texts(&folder);
+    let sweep = |options: &str, code| {
+        let drawn = ["--vary", "m ~ normal(1 kg, 0.2 kg)", "--runs", "300", "--for", "0.3 s"];
+        let args = [&["sweep", "spring.fric", "fixed"], &drawn[..], &options.split(' ').collect::<Vec<_>>()].concat();
+        run(&folder, &args, code)
+    };
+    for (options, words) in [
+        ("--keep summary --out t.csv", "the name of statistics ends in .json"),
+        ("--out t.json", "statistics without rows are written with --keep summary"),
+        ("--keep summary --plot t.svg", "--keep both"),
+        ("--keep summary --best 5_by_max(x)", "--best"),
+        ("--keep both --shard 1/2", "--plan and --unit"),
+        ("--keep sums", "rows, summary, both"),
+    ] {
+        let (out, err) = sweep(&options.replace("5_by_max(x)", "5 by max(x)"), 2);
+        assert!((out + &err).contains(words), "{options}: {err}");
+    }
+    let many = ["--vary", "k = 1 N/m .. 50 N/m lin 40000", "--vary", "m ~ normal(1 kg, 0.2 kg)", "--keep", "summary"];
+    let (_, err) = run(&folder, &[&["sweep", "spring.fric", "fixed"], &many[..]].concat(), 2);
+    assert!(err.contains("at 40,000 points of the grids are too many"), "{err}");
+    let (out, _) = sweep("--keep summary --no-error", 0);
+    assert!(out.contains("measure") && out.contains("median") && out.contains("wrote sweep.json"), "{out}");
+    let (out, _) = sweep("--keep both --out t.csv --no-error", 0);
+    assert!(out.contains("wrote t.csv, t.json"), "{out}");
+    // Blocks that were changed are made again; those of another sweep are refused.
+    let whole = fs::read(folder.join("sweep.json")).unwrap();
+    let asked: serde_json::Value = serde_json::from_slice(&whole).unwrap();
+    let mut asked: Vec<&str> = asked["asked"].as_array().unwrap().iter().map(|line| line.as_str().unwrap()).collect();
+    asked.insert(asked.len() - 1, "--keep summary");
+    fs::write(folder.join(".sweep.json.unfinished"), format!("{}\n\n", asked.join("\n"))).unwrap();
+    fs::write(folder.join(".sweep.json.blocks"), "0,[256,[],[],[],[]]\n").unwrap();
+    let (_, err) = sweep("--keep summary --no-error --resume", 0);
+    assert!(err.contains("row 0 of .sweep.json.blocks is missing or not as it was written"), "{err}");
+    assert!(fs::read(folder.join("sweep.json")).unwrap() == whole);
+    fs::write(folder.join(".sweep.json.unfinished"), "asked for something else\n\n").unwrap();
+    let (_, err) = sweep("--keep summary --resume", 1);
+    assert!(err.contains("was begun with other settings"), "{err}");
 }
 
 /// The script for Slurm, as the scheduler would start it: each task with its number, some of them twice.

@@ -50,7 +50,8 @@ pub fn sweep_plan<'py>(
 ) -> PyResult<Bound<'py, PyBytes>> {
     let method = solver.map(|name| method(py, name)).transpose()?;
     let changes = Changes { set, method, step, tol, duration, ..Changes::default() };
-    let plan = guarded(py, || py.detach(|| text.inner().plan(experiment, &vary, &changes, runs, seed)))?;
+    let plan =
+        guarded(py, || py.detach(|| text.inner().plan(experiment, &vary, &changes, (runs, seed), embed::Keep::Rows)))?;
     plan.map(|plan| PyBytes::new(py, &plan)).map_err(|found| raise::problems(py, &found))
 }
 

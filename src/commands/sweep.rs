@@ -8,6 +8,8 @@
 mod best;
 mod errors;
 mod summary;
+mod sketch;
+mod statistics;
 mod request;
 mod plan;
 mod unit;
@@ -19,11 +21,11 @@ use self::plan::Plan;
 use self::request::{Fault, Request};
 pub use self::request::{Fault as SweepFault, Request as SweepRequest};
 pub use self::sent::{Rows, Sent};
-use self::sink::{Before, Sink};
-use self::summary::Summary;
+use self::sink::{Before, Finished, Sink};
+use self::statistics::Cut;
 use super::shared::progress;
 use super::{End, has_experiment, load_from};
-use crate::args::Sweep;
+use crate::args::{Keep, Sweep};
 use crate::compile::{Loaded, Method, PreparedRun, Stopwatch, Varying};
 use crate::named_files::NamedFiles;
 use crate::parquet::Holds;
@@ -77,25 +79,37 @@ pub fn sweep(args: &Sweep, terminal: &mut Terminal) -> End {
     })
 }
 
-/// The name of the table.
-fn table_name(args: &Sweep) -> Result<PathBuf, Fault> {
-    let out = args.out.clone().unwrap_or_else(|| "sweep.csv".into());
-    match out.extension().and_then(|extension| extension.to_str()) {
-        Some("csv" | "parquet") => Ok(out),
-        None if args.shard.is_none() => Ok(out),
-        None => Err(Fault::Misused(
-            "--shard is for tables: the files of a dataset are parts already; see --plan and --unit".into(),
-        )),
-        Some(_) => Err(Fault::Misused(format!(
-            "--out {}: the name of a table ends in .csv or .parquet, that of a dataset, a folder, has no ending",
-            out.display()
-        ))),
-    }
+/// The name of the table, or of the statistics if no rows are kept.
+fn table_name(args: &Sweep, keep: Keep) -> Result<PathBuf, Fault> {
+    let default = if keep.rows() { "sweep.csv" } else { "sweep.json" };
+    let out = args.out.clone().unwrap_or_else(|| default.into());
+    let named = out.display();
+    let why = match out.extension().and_then(|extension| extension.to_str()) {
+        _ if args.shard.is_some() && keep.statistics() => {
+            format!(
+                "--keep {}: the statistics are those of all runs, and --shard has a part: see --plan and --unit",
+                keep.name()
+            )
+        }
+        Some("json") if !keep.rows() && args.plot.is_some() => {
+            "--plot needs the rows, which --keep summary drops: --keep both".into()
+        }
+        Some("json") if !keep.rows() => return Ok(out),
+        _ if !keep.rows() => format!("--out {named}: the name of statistics ends in .json"),
+        Some("csv" | "parquet") => return Ok(out),
+        None if args.shard.is_none() => return Ok(out),
+        None => "--shard is for tables: the files of a dataset are parts already; see --plan and --unit".into(),
+        Some("json") => format!("--out {named}: statistics without rows are written with --keep summary"),
+        Some(_) => format!(
+            "--out {named}: the name of a table ends in .csv or .parquet, that of a dataset, a folder, has no ending"
+        ),
+    };
+    Err(Fault::Misused(why))
 }
 
 /// The sweep of a text: run, or written as a plan.
 fn of_text(args: &Sweep, terminal: &mut Terminal) -> Result<End, Fault> {
-    let out = table_name(args)?;
+    let out = table_name(args, args.keep.unwrap_or_default())?;
     let sources = NamedFiles::default();
     let Some(mut loaded) = load_from(&args.file, &sources, terminal, &mut Stopwatch::start("read")) else {
         return Ok(End::Failed);
@@ -118,9 +132,15 @@ fn of_text(args: &Sweep, terminal: &mut Terminal) -> Result<End, Fault> {
     let bytes = plan::bytes(&table.request, &root.name, &root.text, &sources.all());
     project::write(path, &bytes).map_err(|error| Fault::Failed(format!("cannot write {}: {error}", path.display())))?;
     if !args.quiet {
-        terminal.line(&format!("wrote {}: {} runs of {name}", path.display(), count(table.total())));
+        let blocks =
+            if table.items() == table.total() { String::new() } else { format!(" in {} blocks", count(table.items())) };
+        terminal.line(&format!("wrote {}: {} runs of {name}{blocks}", path.display(), count(table.total())));
         terminal.line(&format!("  run a part:  fric sweep --unit 0/8 {}", path.display()));
-        terminal.line(&format!("  join all:    fric sweep --join {} *.fricunit --out sweep.csv", path.display()));
+        terminal.line(&format!(
+            "  join all:    fric sweep --join {} *.fricunit --out {}",
+            path.display(),
+            table_name(args, table.request.keep)?.display()
+        ));
     }
     Ok(End::Fine)
 }
@@ -165,7 +185,7 @@ impl Planned {
             ));
         }
         let Planned { hash, table, .. } = self;
-        let runs = unit::runs(which, table.total(), &|name| std::env::var(name).ok()).map_err(Fault::Misused)?;
+        let runs = unit::runs(which, table.items(), &|name| std::env::var(name).ok()).map_err(Fault::Misused)?;
         let named = || PathBuf::from(format!("runs-{}-{}.fricunit", runs.start, runs.end));
         let out = args.out.clone().unwrap_or_else(named);
         let told = |error: io::Error| Fault::Failed(format!("cannot write {}: {error}", out.display()));
@@ -174,7 +194,12 @@ impl Planned {
         match unit::read_file(&out, &hash, &mut |_, _| Ok(())) {
             Ok((found, _)) if found == runs => {
                 if !args.quiet {
-                    terminal.line(&format!("{} has its {} runs already", out.display(), count(size)));
+                    terminal.line(&format!(
+                        "{} has its {} {} already",
+                        out.display(),
+                        count(size),
+                        table.unit_of_work()
+                    ));
                 }
                 return Ok(End::Fine);
             }
@@ -183,8 +208,9 @@ impl Planned {
             Err(unit::Fault::Unreadable(_)) if !out.exists() => {}
             Ok(_) | Err(_) => {
                 return Err(Fault::Failed(format!(
-                    "{} is there, and it is not the unit of runs {}..{} of this plan: give this one another --out, or remove it",
+                    "{} is there, and it is not the unit of {} {}..{} of this plan: give this one another --out, or remove it",
                     out.display(),
+                    table.unit_of_work(),
                     runs.start,
                     runs.end
                 )));
@@ -202,7 +228,7 @@ impl Planned {
                 }
                 put(row)
             };
-            Ok(table.rows(runs.clone(), threads, &dice, &stopped, put)? == size)
+            Ok(table.computed(runs.clone(), threads, &dice, &stopped, put)? == size)
         });
         bar.clear();
         if written.map_err(told)?.is_none() {
@@ -211,7 +237,8 @@ impl Planned {
         }
         if !args.quiet {
             let wall = quantity::duration(begin.elapsed().as_secs_f64(), 3);
-            terminal.line(&format!("wrote {}: runs {}..{} in {wall}", out.display(), runs.start, runs.end));
+            let what = table.unit_of_work();
+            terminal.line(&format!("wrote {}: {what} {}..{} in {wall}", out.display(), runs.start, runs.end));
         }
         Ok(End::Fine)
     }
@@ -219,11 +246,11 @@ impl Planned {
     /// Joins units to the table of the whole.
     fn join(self, args: &Sweep, terminal: &mut Terminal) -> Result<End, Fault> {
         let Planned { path, hash, loaded, table } = self;
-        let out = table_name(args)?;
+        let out = table_name(args, table.request.keep)?;
         let (mut units, mut faults) = (Vec::new(), Vec::new());
         for path in &args.rest {
             match unit::read_file(path, &hash, &mut |_, _| Ok(())) {
-                Ok((runs, hash)) if runs.end <= table.total() => {
+                Ok((runs, hash)) if runs.end <= table.items() => {
                     units.push(unit::Found { path: path.clone(), runs, hash })
                 }
                 Ok((runs, _)) => faults.push((path, unit::Fault::Changed(unit::Head { plan: hash.clone(), runs }))),
@@ -231,7 +258,7 @@ impl Planned {
             }
         }
         let faults: Vec<String> = faults.iter().map(|(unit, fault)| fault.words(unit, &path)).collect();
-        let cover = unit::cover(&units, table.total());
+        let cover = unit::cover(&units, table.items());
         if args.missing {
             faults.iter().for_each(|fault| terminal.error(fault));
             cover.missing.iter().for_each(|runs| terminal.line(&format!("{}..{}", runs.start, runs.end)));
@@ -252,10 +279,11 @@ impl Planned {
         if let Some(first) = cover.missing.first() {
             let runs: u64 = cover.missing.iter().map(|runs| runs.end - runs.start).sum();
             return Err(Fault::Failed(format!(
-                "{} of {} runs are in no unit, the first of them {}..{}: fric sweep --unit {}..{} {} makes them; --missing lists \
+                "{} of {} {} are in no unit, the first of them {}..{}: fric sweep --unit {}..{} {} makes them; --missing lists \
                  all such ranges",
                 count(runs),
-                count(table.total()),
+                count(table.items()),
+                table.unit_of_work(),
                 first.start,
                 first.end,
                 first.start,
@@ -422,7 +450,16 @@ impl SweepTable {
             }
             None => None,
         };
-        Ok(SweepTable { request, cases, vary, slots, grid, draws, columns, best })
+        if best.is_some() && !request.keep.rows() {
+            return Err("--best ranks rows, and --keep summary drops them: it keeps the 16 rows with the lowest and the highest \
+                 values of each measure; or --keep both"
+                .into());
+        }
+        let table = SweepTable { request, cases, vary, slots, grid, draws, columns, best };
+        match table.too_many_groups().filter(|_| table.request.keep.statistics()) {
+            Some(why) => Err(why),
+            None => Ok(table),
+        }
     }
 
     /// The random numbers of all runs.
@@ -600,7 +637,7 @@ impl SweepTable {
     /// Computes the rows, or those of a shard, and writes the table.
     fn run(&self, args: &Sweep, out: &Path, loaded: &Loaded, terminal: &mut Terminal) -> Result<End, String> {
         let begin = Instant::now();
-        let total = self.total();
+        let total = self.items();
         let (shard, shards) = args.shard.unwrap_or((1, 1));
         let part = |i: u64| (u128::from(total) * u128::from(i) / u128::from(shards)) as u64;
         let range = part(shard - 1)..part(shard);
@@ -612,7 +649,7 @@ impl SweepTable {
         let (stopped, threads) = (stopped_by_ctrl_c(), threads(args));
         let rest = "{human_pos} of {human_len}  {per_sec}  {eta} left";
         let bar = progress::bar(range.end - sink.next(), rest, args.quiet);
-        let written = self.rows(sink.next()..range.end, threads, &self.dice(), &stopped, &mut |before, row| {
+        let written = self.computed(sink.next()..range.end, threads, &self.dice(), &stopped, &mut |before, row| {
             if sink.row(self, row)? {
                 bar.at(before + 1);
             }
@@ -624,14 +661,19 @@ impl SweepTable {
             let (reached, rows) = (sink.next(), sink.rows());
             sink.leave().map_err(told)?;
             terminal.report(&format!(
-                "stopped after {} of {} runs, which are kept in {}; go on with --resume\n",
+                "stopped after {} of {} {}, which are kept in {}; go on with --resume\n",
                 count(reached - range.start),
                 count(range.end - range.start),
+                self.unit_of_work(),
                 rows.display()
             ));
             return Ok(End::Failed);
         }
         let wall = begin.elapsed().as_secs_f64();
+        let written = self.cut().map_or(written, |cut| {
+            let runs = cut.runs(range.end - written..range.end);
+            runs.end - runs.start
+        });
         let how = format!(
             "{} runs in {}, {} a second on {threads} thread{}",
             count(written),
@@ -639,8 +681,9 @@ impl SweepTable {
             significant(written as f64 / wall, 3),
             if threads == 1 { "" } else { "s" }
         );
-        let summary = sink.finish(self)?;
-        self.settle(args, out, &summary, &range, &how, &stopped, terminal)
+        let finished = sink.finish(self)?;
+        let runs = self.cut().map_or(range.clone(), |cut| cut.runs(range));
+        self.settle(args, out, &finished, &runs, &how, &stopped, terminal)
     }
 
     /// Writes the table from the rows of units.
@@ -652,9 +695,8 @@ impl SweepTable {
         (units, cover, hash): (&[unit::Found], &unit::Cover, &str),
         terminal: &mut Terminal,
     ) -> Result<End, String> {
-        let range = 0..self.total();
-        let asked = self.asked(loaded, &range);
-        let which = (range.clone(), true);
+        let asked = self.asked(loaded, &(0..self.items()));
+        let which = (0..self.items(), true);
         // What this sweep itself has left there is written anew.
         let mut sink = Sink::begin(self, out, which, asked, Before::Replace, &mut |_| ())?;
         for (k, runs) in &cover.taken {
@@ -679,14 +721,18 @@ impl SweepTable {
         }
         let taken = cover.taken.len();
         let s = if taken == 1 { "" } else { "s" };
-        let how = format!("{} runs from {} unit{s}", count(range.end), taken);
-        let summary = sink.finish(self)?;
-        self.settle(args, out, &summary, &range, &how, &stopped_by_ctrl_c(), terminal)
+        let how = format!("{} runs from {} unit{s}", count(self.total()), taken);
+        let finished = sink.finish(self)?;
+        self.settle(args, out, &finished, &(0..self.total()), &how, &stopped_by_ctrl_c(), terminal)
     }
 
     /// The first line of a table. Only the first shard has one, so that the concatenation of all is the whole.
     fn header(&self, is_first: bool) -> Vec<u8> {
-        if is_first { line(self.columns.iter().map(|column| column.title.clone())) } else { Vec::new() }
+        if is_first && self.request.keep.rows() {
+            line(self.columns.iter().map(|column| column.title.clone()))
+        } else {
+            Vec::new()
+        }
     }
 
     /// What follows a complete table: its figure, summary and errors. `how`: how the rows came.
@@ -695,13 +741,13 @@ impl SweepTable {
         &self,
         args: &Sweep,
         out: &Path,
-        summary: &Summary,
+        finished: &Finished,
         range: &Range<u64>,
         how: &str,
         stopped: &AtomicBool,
         terminal: &mut Terminal,
     ) -> Result<End, String> {
-        if let Some(path) = &args.plot {
+        if let (Some(path), Finished::Rows(summary)) = (&args.plot, finished) {
             let figure = args.look.titled(self.figure(args, summary)?);
             let kind = plot::Kind::of(path).unwrap_or(plot::Kind::Svg);
             let bytes = plot::picture(&figure, &args.look.look(), kind);
@@ -714,7 +760,7 @@ impl SweepTable {
             for note in self.cases.iter().flat_map(|case| &case.notes) {
                 terminal.line(&format!("  note: {note}"));
             }
-            terminal.print(&summary.words(self));
+            terminal.print(&finished.words(self));
             if !args.no_error {
                 match self.errors(range, threads(args), &self.dice(), stopped) {
                     Some(errors) => terminal.print(&errors.words()),
@@ -726,15 +772,19 @@ impl SweepTable {
                     None => {}
                 }
             }
-            let files = args.plot.iter().map(|path| format!(", {}", path.display())).collect::<String>();
+            let beside = (self.request.keep == Keep::Both).then(|| sink::statistics_of(out));
+            let files = beside.iter().chain(&args.plot).map(|path| format!(", {}", path.display())).collect::<String>();
             terminal.line(&format!("  wrote {}{files}", out.display()));
         }
         Ok(End::Fine)
     }
 
-    /// Whether a line of the table can be the row of a run: its number, the varied values, the number of columns, and
+    /// Whether a line can be a block of runs; or a line of the table the row of a run: its number, the varied values, the number of columns, and
     /// numbers in the columns of measures.
     fn is_row(&self, run: u64, row: &str, dice: &Dice) -> bool {
+        if let Some(cut) = self.cut() {
+            return statistics::is_block(self, cut, run, row);
+        }
         let mut reader = csv::ReaderBuilder::new().has_headers(false).flexible(true).from_reader(row.as_bytes());
         let mut record = csv::StringRecord::new();
         if !reader.read_record(&mut record).is_ok_and(|found| found) || record.len() != self.columns.len() {
@@ -756,6 +806,33 @@ impl SweepTable {
             ColumnKind::Verdict => matches!(cell, "" | "true" | "false"),
             ColumnKind::Status => !cell.is_empty(),
         })
+    }
+
+    /// Number of what is computed one by one and handed in: rows, or blocks of runs if no rows are kept.
+    fn items(&self) -> u64 {
+        self.cut().map_or(self.total(), Cut::blocks)
+    }
+
+    /// What [`SweepTable::items`] counts, in words.
+    fn unit_of_work(&self) -> &'static str {
+        if self.request.keep.rows() { "runs" } else { "blocks of runs" }
+    }
+
+    /// Computes rows, or blocks, and passes each, with how many were passed before it, in order; returns how many.
+    fn computed(
+        &self,
+        items: Range<u64>,
+        threads: usize,
+        dice: &Dice,
+        stopped: &AtomicBool,
+        put: &mut dyn FnMut(u64, &[u8]) -> io::Result<()>,
+    ) -> io::Result<u64> {
+        let rows =
+            &mut |runs, see: &mut dyn FnMut(u64, &[u8]) -> io::Result<()>| self.rows(runs, threads, dice, stopped, see);
+        match self.cut() {
+            None => rows(items, put),
+            Some(cut) => self.blocks(cut, items, rows, put),
+        }
     }
 
     /// Computes rows and passes each, with how many were passed before it, in order; returns how many.
@@ -807,7 +884,11 @@ impl SweepTable {
             };
             asked += &format!("--vary {} in {}: {how}\n", vary.path, vary.unit);
         }
-        asked + &format!("--seed {}, runs {}..{} of {}\n", self.seed(), range.start, range.end, self.total())
+        if !self.request.keep.rows() {
+            asked += "--keep summary\n";
+        }
+        let Range { start, end } = self.cut().map_or(range.clone(), |cut| cut.runs(range.clone()));
+        asked + &format!("--seed {}, runs {start}..{end} of {}\n", self.seed(), self.total())
     }
 
     /// The titles of the columns, and what their cells hold.

@@ -4,6 +4,7 @@
 //! library goes by its hash. Reading a plan opens no other file.
 
 use super::request::Request;
+use crate::args::Keep;
 use crate::compile::{self, Loaded, Method};
 use crate::named_files::{NamedFile, NamedFiles};
 use crate::unfinished::Hash;
@@ -11,7 +12,7 @@ use crate::{project, vary};
 use serde_json::{Value, json};
 
 /// The layout of the file. Raised also when a change gives the rows of a sweep other bits.
-const FORMAT: u64 = 1;
+const FORMAT: u64 = 2;
 
 /// A sweep that can be sent elsewhere.
 pub struct Plan {
@@ -51,6 +52,7 @@ pub fn bytes(request: &Request, name: &str, text: &str, files: &[NamedFile]) -> 
         "tol": number(request.tol),
         "duration": number(request.duration),
         "best": request.best,
+        "keep": request.keep.name(),
         "runs": request.runs,
         "seed": request.seed,
         "name": name,
@@ -119,6 +121,7 @@ pub fn read(bytes: &[u8]) -> Result<Plan, String> {
                 best: texts(&object["best"])?,
                 runs: whole("runs")?,
                 seed: whole("seed")?,
+                keep: Keep::ALL.into_iter().find(|keep| object["keep"].as_str() == Some(keep.name()))?,
                 interpret: false,
             },
             text: SentText { name: text("name")?, text: text("text")?, files: files.collect::<Option<_>>()? },
@@ -151,6 +154,7 @@ mod tests {
             duration: Some(1e-300),
             runs: Some(u64::MAX),
             best: vec!["5 by rms(x)".into()],
+            keep: Keep::Summary,
             ..Request::default()
         };
         let files = [("a".to_string(), "b.csv".to_string(), "/c/b.csv".to_string(), "t;x\n\"é\n".to_string())];
@@ -165,12 +169,12 @@ mod tests {
             assert!(why.contains("no whole plan"), "{why}");
         }
         let text = String::from_utf8(written).unwrap();
-        let keys = ["experiment", "vary", "set", "best", "name", "text", "files"];
+        let keys = ["keep", "experiment", "vary", "set", "best", "name", "text", "files"];
         for key in keys {
             assert!(read(text.replace(&format!("\"{key}\":"), "\"other\":").as_bytes()).is_err(), "{key}");
         }
-        let newer = text.replace("\"fric sweep\": 1", "\"fric sweep\": 2");
-        assert!(read(newer.as_bytes()).err().unwrap().contains("kind 2"));
+        let newer = text.replace("\"fric sweep\": 2", "\"fric sweep\": 3");
+        assert!(read(newer.as_bytes()).err().unwrap().contains("kind 3"));
         let other = text.replace(&library(), "0123456789abcdef");
         assert!(read(other.as_bytes()).err().unwrap().contains("another library"));
     }

@@ -5,7 +5,7 @@
 
 use super::SweepTable;
 use super::best::{self, Best};
-use crate::args::Sweep;
+use crate::args::{Keep, Sweep};
 use crate::compile::{self, Changes, Loaded, Method, Options, Sources, Varying};
 use crate::report;
 use crate::vary::{How, Vary};
@@ -27,6 +27,7 @@ pub struct Request {
     pub best: Vec<String>,
     pub runs: Option<u64>,
     pub seed: Option<u64>,
+    pub keep: Keep,
     /// Interprets instead of compiling: the same bits.
     pub interpret: bool,
 }
@@ -66,6 +67,7 @@ impl Request {
             best: args.best.clone(),
             runs: args.runs,
             seed: args.seed,
+            keep: args.keep.unwrap_or_default(),
             interpret: args.interpret,
         }
     }

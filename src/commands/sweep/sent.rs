@@ -45,6 +45,16 @@ impl Sent {
         self.table.total()
     }
 
+    /// Number of what units count: runs, or blocks of runs if only statistics are kept.
+    pub fn items(&self) -> u64 {
+        self.table.items()
+    }
+
+    /// How many runs the first of them have.
+    pub fn runs(&self, items: u64) -> u64 {
+        self.table.cut().map_or(items, |cut| cut.runs(0..items).end)
+    }
+
     /// The title of each column and the type of its values: `numbers`, `integers`, `booleans` or `words`.
     pub fn columns(&self) -> Vec<(String, &'static str)> {
         let word = |holds| match holds {
@@ -56,14 +66,14 @@ impl Sent {
         self.table.kinds().into_iter().map(|(title, holds)| (title, word(holds))).collect()
     }
 
-    /// Runs these on this thread: the bytes of a unit. None if `stopped` was set meanwhile.
+    /// Makes these rows, or blocks, on this thread: the bytes of a unit. None if `stopped` was set meanwhile.
     pub fn unit(&self, runs: Range<u64>, stopped: &AtomicBool) -> Option<Vec<u8>> {
         let head = unit::Head { plan: self.hash.clone(), runs: runs.clone() };
         let write = || -> io::Result<Option<Vec<u8>>> {
             let mut writer = unit::Writer::begin(Vec::new(), &head)?;
             let size = runs.end - runs.start;
             let put = &mut |_, row: &[u8]| writer.row(row);
-            let made = self.table.rows(runs, 1, &self.table.dice(), stopped, put)?;
+            let made = self.table.computed(runs, 1, &self.table.dice(), stopped, put)?;
             if made == size { writer.end().map(Some) } else { Ok(None) }
         };
         write().expect("writing to memory does not fail")
@@ -75,7 +85,7 @@ impl Sent {
     /// Why nothing is written, in words.
     pub fn begin(&self, out: &Path, resume: bool, warn: &mut dyn FnMut(&str)) -> Result<Rows, String> {
         let before = if resume { Before::Continue } else { Before::Nothing };
-        let runs = 0..self.total();
+        let runs = 0..self.items();
         let asked = self.table.asked(&self.loaded, &runs);
         // An interrupted call may have left nothing yet.
         let sink = Sink::begin(&self.table, out, (runs, true), asked, before, warn)?;
@@ -83,13 +93,13 @@ impl Sent {
     }
 }
 
-/// Rows that are being appended.
+/// Rows, or blocks, that are being appended.
 pub struct Rows {
     sink: Sink,
 }
 
 impl Rows {
-    /// The run whose row comes next.
+    /// The run whose row comes next, or the number of the next block.
     pub fn next(&self) -> u64 {
         self.sink.next()
     }

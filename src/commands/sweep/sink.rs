@@ -1,17 +1,18 @@
 //! Where the rows of a sweep go: a table, or a dataset, a folder of Parquet files.
 //!
-//! In: rows in the order of the runs. Out: files that are whole or marked as unfinished, with where to go on after an
+//! In: rows in the order of the runs, or blocks of runs for statistics. Out: files that are whole or marked as unfinished, with where to go on after an
 //! interruption. A table grows row by row. The files of a dataset are cut by the number of runs alone, so the bytes of
 //! each depend on its runs and not on who made it or when; each is written whole or not at all.
 
 use super::SweepTable;
+use super::statistics::Statistics;
 use super::summary::Summary;
 use crate::parquet;
 use crate::project;
 use crate::unfinished::{Hash, Mark, Unfinished};
 use serde_json::json;
 use std::fs::{self, File, OpenOptions};
-use std::io::{self, BufWriter, Write};
+use std::io::{self, BufRead, BufReader, BufWriter, Write};
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
@@ -27,12 +28,19 @@ pub enum Before {
     Replace,
 }
 
-/// The file to which rows are appended: the table itself, or one beside it if the format cannot grow row by row.
+/// The file to which rows, or blocks, are appended: the table itself, or one beside it if the format cannot grow row by
+/// row.
 pub fn rows_of(out: &Path) -> PathBuf {
-    match out.extension().is_some_and(|extension| extension == "parquet") {
-        true => out.with_file_name(format!(".{}.csv", name_of(out))),
-        false => out.to_path_buf(),
+    match out.extension().and_then(|extension| extension.to_str()) {
+        Some("parquet") => out.with_file_name(format!(".{}.csv", name_of(out))),
+        Some("json") => out.with_file_name(format!(".{}.blocks", name_of(out))),
+        _ => out.to_path_buf(),
     }
+}
+
+/// The file with the statistics beside a table.
+pub fn statistics_of(out: &Path) -> PathBuf {
+    out.with_extension("json")
 }
 
 fn name_of(path: &Path) -> String {
@@ -65,6 +73,50 @@ const ABOUT: &str = "_fric.json";
 enum Form {
     Table { writer: BufWriter<File>, mark: Mark },
     Dataset { each: u64, rows: Vec<u8> },
+}
+
+/// What is known after the last row.
+pub enum Finished {
+    /// Of a table or a dataset.
+    Rows(Summary),
+    /// Of statistics alone, in words.
+    Statistics(String),
+}
+
+impl Finished {
+    /// For people.
+    pub fn words(&self, table: &SweepTable) -> String {
+        match self {
+            Finished::Rows(summary) => summary.words(table),
+            Finished::Statistics(words) => words.clone(),
+        }
+    }
+}
+
+/// A file that gets its name when it is whole.
+struct Part<'a> {
+    path: PathBuf,
+    out: &'a Path,
+}
+
+impl Part<'_> {
+    fn begin(out: &Path) -> io::Result<(Part<'_>, BufWriter<File>)> {
+        let path = out.with_file_name(format!(".{}.part", name_of(out)));
+        let file = File::create(&path)?;
+        Ok((Part { path, out }, BufWriter::new(file)))
+    }
+
+    fn end(self, file: BufWriter<File>) -> io::Result<()> {
+        file.into_inner().map_err(io::IntoInnerError::into_error)?.sync_all()?;
+        fs::rename(&self.path, self.out)
+    }
+}
+
+impl Drop for Part<'_> {
+    fn drop(&mut self) {
+        // It is gone after it was renamed.
+        let _ = fs::remove_file(&self.path);
+    }
 }
 
 /// A table or a dataset that is being written.
@@ -253,19 +305,41 @@ impl Sink {
     ///
     /// # Errors
     /// What cannot be read or written, in words.
-    pub fn finish(mut self, table: &SweepTable) -> Result<Summary, String> {
+    pub fn finish(mut self, table: &SweepTable) -> Result<Finished, String> {
         assert_eq!(self.next, self.runs.end, "not all rows have come");
         let told = |what: &str, error: io::Error| format!("cannot {what} {}: {error}", self.out.display());
+        let beside = statistics_of(&self.out);
+        let about = |error: io::Error| format!("cannot write {}: {error}", beside.display());
+        let mut statistics = match table.request.keep.statistics() {
+            true => {
+                let (part, file) = Part::begin(&beside).map_err(about)?;
+                Some((part, Statistics::begin(table, &self.asked, file).map_err(about)?))
+            }
+            false => None,
+        };
+        if let Form::Table { writer, .. } = &mut self.form {
+            writer.flush().map_err(|error| told("write", error))?;
+            writer.get_ref().sync_all().map_err(|error| told("write", error))?;
+        }
+        let rows = rows_of(&self.out);
+        if let (false, Some((_, statistics))) = (table.request.keep.rows(), &mut statistics) {
+            let blocks = File::open(&rows).map_err(|error| told("read", error))?;
+            for line in BufReader::with_capacity(1 << 18, blocks).lines() {
+                line.and_then(|line| statistics.block(&line)).map_err(|error| told("read", error))?;
+            }
+        }
+        let mut also = |cells: &csv::StringRecord| match &mut statistics {
+            Some((_, statistics)) => statistics.row(cells),
+            None => Ok(()),
+        };
         let summary = match &mut self.form {
-            Form::Table { writer, .. } => {
-                writer.flush().map_err(|error| told("write", error))?;
-                writer.get_ref().sync_all().map_err(|error| told("write", error))?;
-                let rows = rows_of(&self.out);
-                let summary = table.summary(&rows, self.has_header).map_err(|error| told("read", error))?;
+            Form::Table { .. } if !table.request.keep.rows() => None,
+            Form::Table { .. } => {
+                let summary = table.summary(&rows, self.has_header, &mut also).map_err(|error| told("read", error))?;
                 if rows != self.out {
                     convert(table, &rows, self.has_header, &self.out).map_err(|error| told("write", error))?;
                 }
-                summary
+                Some(summary)
             }
             Form::Dataset { each, .. } => {
                 let each = *each;
@@ -273,36 +347,48 @@ impl Sink {
                 for first in (0..self.runs.end).step_by(each as usize) {
                     let path = part(&self.out, first);
                     let bytes = fs::read(&path).map_err(|error| format!("cannot read {}: {error}", path.display()))?;
-                    parquet::rows(bytes, &mut |cells| summary.see(cells))
-                        .map_err(|error| format!("cannot read {}: {error}", path.display()))?;
+                    let mut failed = Ok(());
+                    parquet::rows(bytes, &mut |cells| {
+                        summary.see(cells);
+                        if failed.is_ok() {
+                            failed = also(cells);
+                        }
+                    })
+                    .map_err(|error| format!("cannot read {}: {error}", path.display()))?;
+                    failed.map_err(about)?;
                 }
-                let about = json!({
+                let object = json!({
                     "asked": self.asked.lines().collect::<Vec<_>>(),
                     "runs": self.runs.end,
                     "rows a file": each,
                     "columns": table.kinds().into_iter().map(|(title, _)| title).collect::<Vec<_>>(),
                 });
-                let about = format!("{about:#}\n");
-                project::write(&self.out.join(ABOUT), about.as_bytes()).map_err(|error| told("write", error))?;
-                summary
+                let object = format!("{object:#}\n");
+                project::write(&self.out.join(ABOUT), object.as_bytes()).map_err(|error| told("write", error))?;
+                Some(summary)
             }
         };
+        let mut words = String::new();
+        if let Some((part, statistics)) = statistics {
+            let file;
+            (file, words) = statistics.end().map_err(about)?;
+            part.end(file).map_err(about)?;
+        }
+        if summary.is_none() {
+            // The blocks have done their work.
+            fs::remove_file(&rows).map_err(|error| told("write", error))?;
+        }
         self.unfinished.finish();
-        Ok(summary)
+        Ok(summary.map_or(Finished::Statistics(words), Finished::Rows))
     }
 }
 
 /// Converts the rows to a Parquet file, after which they are no longer needed.
 fn convert(table: &SweepTable, rows: &Path, has_header: bool, out: &Path) -> io::Result<()> {
-    let part = out.with_file_name(format!(".{}.part", name_of(out)));
-    let written = File::create(&part)
-        .and_then(|to| parquet::from_csv(File::open(rows)?, has_header, &table.kinds(), to))
-        .and_then(|()| fs::rename(&part, out))
-        .and_then(|()| fs::remove_file(rows));
-    if written.is_err() {
-        let _ = fs::remove_file(&part);
-    }
-    written
+    let (part, mut file) = Part::begin(out)?;
+    parquet::from_csv(File::open(rows)?, has_header, &table.kinds(), &mut file)?;
+    part.end(file)?;
+    fs::remove_file(rows)
 }
 
 #[test]

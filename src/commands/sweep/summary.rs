@@ -26,12 +26,21 @@ const MOST_KEPT: u64 = 4_000_000;
 
 impl SweepTable {
     /// Reads the file once.
-    pub(super) fn summary(&self, path: &Path, header: bool) -> io::Result<Summary> {
+    ///
+    /// # Errors
+    /// Those of the file and of `also`, which is called with each row.
+    pub(super) fn summary(
+        &self,
+        path: &Path,
+        header: bool,
+        also: &mut dyn FnMut(&csv::StringRecord) -> io::Result<()>,
+    ) -> io::Result<Summary> {
         let mut reader = csv::ReaderBuilder::new().has_headers(header).from_path(path).map_err(io::Error::other)?;
         let mut summary = self.no_summary();
         let mut record = csv::StringRecord::new();
         while reader.read_record(&mut record).map_err(io::Error::other)? {
             summary.see(&record);
+            also(&record)?;
         }
         Ok(summary)
     }
@@ -127,7 +136,7 @@ struct Ended {
 }
 
 /// A reason without numbers and their units, because these differ from run to run. Names in backticks stay.
-fn kind(status: &str) -> String {
+pub(super) fn kind(status: &str) -> String {
     let mut kept = Vec::new();
     for (k, part) in status.split('`').enumerate() {
         let mut words = part.split_whitespace();
@@ -424,7 +433,7 @@ impl Summary {
 }
 
 /// Lines of cells, in columns.
-fn aligned(lines: &[Vec<String>]) -> String {
+pub(super) fn aligned(lines: &[Vec<String>]) -> String {
     let count = lines.iter().map(Vec::len).max().unwrap_or(0);
     let width = |k: usize| lines.iter().filter_map(|line| line.get(k)).map(|cell| cell.chars().count()).max();
     let widths: Vec<usize> = (0..count).map(|k| width(k).unwrap_or(0)).collect();
