@@ -76,7 +76,7 @@ pub enum Command {
     Linearise(Linearise),
     /// Time the step of an experiment: alone, in lanes, on all cores
     Bench(Bench),
-    /// Export a model as C or machine code, or a rig as a package
+    /// Export a model as C, machine code or a function for Python, or a rig as a package
     Build(Build),
     /// Run a rig against the drives on its buses, or with --sim against simulated ones
     Hil(Hil),

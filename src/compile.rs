@@ -15,6 +15,7 @@ pub use compiler::analysis::tuning::Tuned;
 pub use compiler::codegen::c::Files as CFiles;
 pub use compiler::codegen::elementary::ElementaryFunction;
 use compiler::codegen::lanes;
+pub use compiler::codegen::python::Dialect;
 use compiler::codegen::target::{self, FunctionCompiler};
 use compiler::codegen::unsupported::Unsupported;
 use compiler::codegen::{c, image, jit};
@@ -36,7 +37,7 @@ pub use compiler::rig::{StepDerivative, bus_load, linear as linear_of};
 pub use compiler::{
     Built, Case, Changes, CompiledRig, Loaded, Options, SourceFile, Sources, adjustable, build, check,
     check_declarations, compile, dissipation, explain, explain_changed, explain_in, explain_rig, explain_run, fit,
-    linear, load, quantities, rig, stepping, varying,
+    linear, load, python, quantities, rig, stepping, varying,
 };
 use grammar::diagnostic::Diagnostic;
 use runtime::engine::sweep;
@@ -84,6 +85,27 @@ pub enum Emit {
     Asm,
     /// A position-independent image of machine code, for `fric-rig` and other loaders
     Blob,
+    /// A Python function of states, inputs and parameters, for NumPy
+    Numpy,
+    /// The same for JAX: gradients, many instances, other processors
+    Jax,
+    /// The same as a `casadi.Function`
+    Casadi,
+    /// The same as formulas of SymPy
+    Sympy,
+}
+
+impl Emit {
+    /// The dialect of Python source.
+    pub fn dialect(self) -> Option<Dialect> {
+        match self {
+            Emit::Numpy => Some(Dialect::Numpy),
+            Emit::Jax => Some(Dialect::Jax),
+            Emit::Casadi => Some(Dialect::Casadi),
+            Emit::Sympy => Some(Dialect::Sympy),
+            Emit::C | Emit::Ir | Emit::Passes | Emit::Clif | Emit::Asm | Emit::Blob => None,
+        }
+    }
 }
 
 /// Emits a model or an experiment. The step of a model without experiment uses `solver`, by default `expo`; an
@@ -143,6 +165,7 @@ pub fn emit(
             let image = image::image(&functions, description, &built.program.params, made_for, more).map_err(told)?;
             return Ok(image.to_bytes());
         }
+        Emit::Numpy | Emit::Jax | Emit::Casadi | Emit::Sympy => unreachable!("`python` makes them, from the text"),
     };
     Ok(text.into_bytes())
 }

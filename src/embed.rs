@@ -9,8 +9,8 @@ use crate::characterise::{Extent, page, study};
 use crate::commands::sweep::{self, SweepFault, SweepRequest};
 pub use crate::commands::sweep::{Rows as SweepRows, Sent as Sweep};
 use crate::commands::{characterise, explain, linearise};
-pub use crate::compile::Ports;
 use crate::compile::{self, Built, Case, Changes, Idle, Loaded, Options, Stages};
+pub use crate::compile::{Dialect, Ports};
 use crate::figure::{self, Kept};
 pub use crate::named_files::NamedFile;
 use crate::named_files::NamedFiles;
@@ -313,6 +313,16 @@ impl Text {
         let mut loaded = self.loaded.clone();
         let built = compile::build(&mut loaded, &self.sources, model, changes, &mut Vec::new());
         built.map_err(|found| Problems::of(&loaded, &found))
+    }
+
+    /// A model as Python source: `f(t, x, u, p) -> dx, y` for the library of a dialect.
+    ///
+    /// # Errors
+    /// All errors of the model, and of the changes; statements that are no function of the present.
+    pub fn python(&self, model: &str, changes: &Changes, dialect: Dialect) -> Result<String, Problems> {
+        let mut loaded = self.loaded.clone();
+        let text = compile::python(&mut loaded, &self.sources, model, changes, dialect, &mut Vec::new());
+        text.map_err(|found| Problems::of(&loaded, &found))
     }
 
     /// The quantities of an experiment: path and SI unit.

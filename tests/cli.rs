@@ -389,6 +389,28 @@ fn a_model_can_be_exported() {
     assert!(!folder.0.join("x").exists());
 }
 
+#[test]
+fn a_model_becomes_a_function_for_python() {
+    let text = "model M {\n  input u [N]\n  param m = 2 kg in > 0\n  state v [m/s] = 0\n  dv/dt = u / m\n}\n\
+                model Jumps {\n  input u [N]\n  state v [m/s] = 0\n  dv/dt = u / 1 kg\n  when v > 1 m/s { reset(v) = 0 }\n}\n\
+                experiment pushed { run M(u = 2 N) for 1 s }\n";
+    let folder = Folder::new("python").with("m.fric", text);
+    for (dialect, word) in
+        [("numpy", "import numpy as np"), ("jax", "jax.numpy"), ("casadi", "ca.Function"), ("sympy", "sp.Symbol")]
+    {
+        let (source, _) = folder.check(&["build", "m.fric", "M", "--emit", dialect], 0, word);
+        assert!(source.contains("u / m") && source.contains("\"m\",  # kg, from 0"), "{source}");
+        folder.check(&["build", "m.fric", "pushed", "--emit", dialect], 0, "INPUTS = ()");
+        folder.check(&["build", "m.fric", "Jumps", "--emit", dialect], 1, "m.fric:11:3");
+        folder.check(&["build", "m.fric", "Jumps", "--emit", dialect], 1, "E0911");
+    }
+    folder.check(&["build", "m.fric", "M", "--emit", "numpy", "-o", "m.py"], 0, "wrote m.py");
+    folder.check(&["build", "m.fric", "M", "--emit", "numpy", "-o", "made/"], 2, "only C code");
+    folder.check(&["build", "m.fric", "M", "--emit", "numpy", "--solver", "rk4"], 2, "no steps");
+    folder.check(&["build", "m.fric", "M", "--emit", "numpy", "--set", "m=0kg"], 1, "m");
+    folder.check(&["build", "m.fric", "M", "--emit", "nunpy"], 2, "numpy");
+}
+
 /// C code in a folder: two files that compile without warnings, as C and as C++, and compute the bits of the run.
 #[test]
 fn a_model_goes_into_a_folder_with_its_header() {

@@ -134,6 +134,7 @@ const NOT_GIVEN: &[(&str, &str)] = &[];
 const ELSEWHERE: &[(&str, &str)] = &[
     ("E0906", "a search finds it: tests/fits.rs"),
     ("E0907", "a search finds it: tests/fits.rs"),
+    ("E0911", "`fric build --emit numpy` finds it: tests/cli.rs"),
     ("W0910", "a search finds it: tests/fits.rs"),
     ("W0902", "a search finds it: tests/fits.rs"),
     ("W0903", "a search finds it: tests/fits.rs"),

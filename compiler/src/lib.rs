@@ -254,6 +254,42 @@ pub fn build(
     Ok(Built { program, solver: None })
 }
 
+/// A model, or the first combination of an experiment's sweeps, as Python source: see [`codegen::python`].
+///
+/// # Errors All errors of the model or experiment; E0911 for each statement that is no function of the present.
+pub fn python(
+    loaded: &mut Loaded,
+    sources: &dyn Sources,
+    name: &str,
+    changes: &Changes,
+    dialect: codegen::python::Dialect,
+    warnings: &mut Vec<Diagnostic>,
+) -> Result<String, Vec<Diagnostic>> {
+    let root = loaded.root();
+    let Some((model, file)) = model_of(loaded, name) else {
+        let variant = first(loaded, sources, name, changes, warnings)?;
+        let mut found = Vec::new();
+        if variant.rig.is_some() {
+            let place = loaded.experiments().into_iter().find(|experiment| experiment.name == name);
+            let error = Diagnostic::error("E0911", "a rig is no function of the present state");
+            let span = place.map_or(grammar::span::Span::new(root, 0, 0), |experiment| experiment.span);
+            found.push(error.label(span, "runs a rig, which has ticks").help("name a model of it"));
+        }
+        analysis::explicit::check(&variant.system, dialect, &mut found);
+        return if found.is_empty() {
+            Ok(codegen::python::source(&variant.program, dialect))
+        } else {
+            Err(once(found))
+        };
+    };
+    let given = experiment::overrides(loaded, changes, warnings);
+    let overrides = given.iter().map(|change| change.override_in(root)).collect();
+    let (system, types, ()) = sound(loaded, sources, (&model, file), overrides, warnings, |system, diagnostics| {
+        analysis::explicit::check(system, dialect, diagnostics);
+    })?;
+    Ok(codegen::python::source(&lower::lower(&system, &types, &[]).program, dialect))
+}
+
 /// Prepares a model or an experiment for linearisation; `name` is the name of either. Takes the first combination of an
 /// experiment's sweeps.
 ///

@@ -6,6 +6,7 @@ import json
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -522,6 +523,20 @@ class Model:
         if output not in self.outputs and output not in self.states:
             raise unknown("output", output, [*self.outputs, *self.states])
         return x, self._text._inner.steady(self.name, self._settings(), output, inputs)
+
+    def emit(self, dialect: str) -> str:
+        """The model as Python source for ``numpy``, ``jax``, ``casadi`` or ``sympy``, as ``fric build --emit``."""
+        return self._text._inner.emit(self.name, self._settings(), dialect)
+
+    def module(self, dialect: str) -> ModuleType:
+        """The module of that source: ``f``, ``start``, and the names of rows in ``STATES``, ``INPUTS``, ``PARAMS``, ``OUTPUTS``."""
+        made = ModuleType(f"{self.name}_{dialect}")
+        exec(compile(self.emit(dialect), f"<{self.name} for {dialect}>", "exec"), made.__dict__)
+        return made
+
+    def function(self, dialect: str) -> Callable[..., Any]:
+        """The pure function ``f(t, x, u, p) -> dx, y`` of that source: rates of the states and outputs, in SI."""
+        return self.module(dialect).f
 
     def characterise(self) -> Study:
         """Runs a friction model (an input ``v`` and an output ``F``) through the standard battery of experiments."""

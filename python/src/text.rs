@@ -2,16 +2,17 @@
 
 use crate::watched::{guarded, watched};
 use crate::{arrays, raise};
-use abi::Slot;
-use abi::description::{Kind, Quantity};
+use abi::description::{Kind, Quantity, Segment};
 use abi::plan::Method;
 use abi::unit::Unit;
+use abi::{Function, Instance, Slot};
 use compiler::{Built, Changes, Options};
-use fric::embed;
+use fric::embed::{self, Dialect};
 use pyo3::exceptions::{PyOSError, PyValueError};
 use pyo3::prelude::*;
 use runtime::record::Recording;
 use std::path::PathBuf;
+use std::sync::Arc;
 
 /// A text with its experiments and models.
 #[pyclass(frozen, module = "fric._fric")]
@@ -149,6 +150,63 @@ impl Text {
     fn characterise(&self, py: Python, model: &str, set: Vec<(String, String)>) -> PyResult<(String, String)> {
         let found = watched(py, None, |_| self.text.characterise(model, &set))?;
         found.map_err(PyValueError::new_err)
+    }
+
+    /// A model as Python source for a library.
+    fn emit(&self, py: Python, model: &str, set: Vec<String>, dialect: &str) -> PyResult<String> {
+        let all: Vec<String> = Dialect::ALL.iter().map(|one| one.name().to_string()).collect();
+        let found = Dialect::ALL.into_iter().find(|one| one.name() == dialect);
+        let dialect = found.ok_or_else(|| raise::unknown(py, "dialect", dialect, &all))?;
+        let changes = Changes { set, ..Changes::default() };
+        let text = guarded(py, || py.detach(|| self.text.python(model, &changes, dialect)))?;
+        text.map_err(|found| raise::problems(py, &found))
+    }
+
+    /// What the functions of [`emit`](Text::emit) compute, by the interpreter. `points`: time, states, inputs, parameters
+    /// and regimes. Returns for each rates, outputs, states at the start, and regimes after a transition.
+    fn evaluate(
+        &self,
+        py: Python,
+        model: &str,
+        set: Vec<String>,
+        points: Vec<(f64, [Vec<f64>; 4])>,
+    ) -> PyResult<Vec<[Vec<f64>; 4]>> {
+        let program = self.built(py, model, Changes { set, ..Changes::default() })?.program;
+        let description = &program.description;
+        let layout = &description.layout;
+        let code = compiler::codegen::tiering::on_demand(&program, Method::Adaptive, true);
+        let mut instance = Instance::new(Arc::new(description.clone()), code, &program.params);
+        let outputs = description.quantities.iter().filter(|quantity| quantity.kind == Kind::Output);
+        let outputs: Vec<Slot> = outputs.map(|quantity| quantity.slot).collect();
+        let segments = [layout.states, layout.inputs, layout.params, layout.regimes];
+        let at = |(time, rows): (f64, [Vec<f64>; 4])| {
+            if rows.iter().zip(segments).any(|(row, segment)| row.len() != segment.len as usize) {
+                let lens = segments.map(|segment| segment.len);
+                return Err(PyValueError::new_err(format!(
+                    "{lens:?} states, inputs, parameters and regimes are needed"
+                )));
+            }
+            let read = |instance: &Instance, segment: Segment| instance.block()[segment.range()].to_vec();
+            let write = |instance: &mut Instance, which: &[usize]| {
+                instance.set(Slot::TIME, time);
+                for k in which {
+                    instance.block_mut()[segments[*k].range()].copy_from_slice(&rows[*k]);
+                }
+            };
+            write(&mut instance, &[1, 2]);
+            instance.call(Function::Start);
+            let start = read(&instance, layout.states);
+            write(&mut instance, &[0, 1, 2, 3]);
+            instance.call(Function::Derivatives);
+            instance.call(Function::Outputs);
+            let rates = read(&instance, layout.derivatives);
+            let seen = outputs.iter().map(|slot| instance.get(*slot)).collect();
+            if layout.regimes.len > 0 {
+                instance.call(Function::Transitions);
+            }
+            Ok([rates, seen, start, read(&instance, layout.regimes)])
+        };
+        points.into_iter().map(at).collect()
     }
 
     /// All named quantities of a model on its own.

@@ -26,7 +26,7 @@ pub fn build(args: &Build, terminal: &mut Terminal) -> End {
         }
         (None, false) => {
             terminal.error(
-                "make what? --emit c, ir, passes, clif, asm or blob; C with a header with --out FOLDER/; a rig becomes a package with --out NAME.fricpkg",
+                "make what? --emit c, ir, passes, clif, asm or blob; numpy, jax, casadi or sympy; C with a header with --out FOLDER/; a rig becomes a package with --out NAME.fricpkg",
             );
             return End::Misused;
         }
@@ -78,6 +78,27 @@ pub fn build(args: &Build, terminal: &mut Terminal) -> End {
     }
     let changes = args.stepped.changes();
     let mut found = Vec::new();
+    if let Some(dialect) = emit.dialect() {
+        if args.stepped.solver.is_some() || args.stepped.step.is_some() || args.target.is_some() {
+            let name = dialect.name();
+            terminal.error(&format!(
+                "a function for {name} has no steps and no processor: leave --solver, --step and --target out"
+            ));
+            return End::Misused;
+        }
+        return match compile::python(&mut loaded, &crate::disk::Disk, &name, &changes, dialect, &mut found) {
+            Ok(text) => {
+                if !found.is_empty() {
+                    reported(&loaded, &found, terminal);
+                }
+                written(args.out.as_deref(), text.as_bytes(), terminal)
+            }
+            Err(diagnostics) => {
+                reported(&loaded, &diagnostics, terminal);
+                End::Failed
+            }
+        };
+    }
     let built = match compile::build(&mut loaded, &crate::disk::Disk, &name, &changes, &mut found) {
         Ok(built) => built,
         Err(diagnostics) => {
@@ -110,11 +131,16 @@ pub fn build(args: &Build, terminal: &mut Terminal) -> End {
             return End::Failed;
         }
     };
-    let Some(out) = &args.out else {
-        terminal.print(&String::from_utf8(bytes).expect("all but images are texts"));
+    written(args.out.as_deref(), &bytes, terminal)
+}
+
+/// Writes what was made into a file, or to the standard output.
+fn written(out: Option<&Path>, bytes: &[u8], terminal: &mut Terminal) -> End {
+    let Some(out) = out else {
+        terminal.print(std::str::from_utf8(bytes).expect("all but images are texts"));
         return End::Fine;
     };
-    if let Err(error) = project::write(out, &bytes) {
+    if let Err(error) = project::write(out, bytes) {
         terminal.error(&format!("cannot write {}: {error}", out.display()));
         return End::Failed;
     }

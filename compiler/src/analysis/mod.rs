@@ -15,5 +15,6 @@ pub mod lints;
 pub mod explain;
 pub mod step_stability_report;
 pub mod linearise;
+pub mod explicit;
 pub mod pushes;
 pub mod slow_sensor;

@@ -199,7 +199,7 @@ fn header(functions: &[(Function, Func)], description: &Description, names: &Nam
 }
 
 /// A range in SI units in words; `None` if it is open.
-fn range((low, high): (f64, f64)) -> Option<String> {
+pub(super) fn range((low, high): (f64, f64)) -> Option<String> {
     let number = |x: f64| if x.abs() == TINY { "0".to_string() } else { significant(x, 6) };
     Some(match (low.is_finite(), high.is_finite()) {
         (true, true) => format!("{} .. {}", number(low), number(high)),
@@ -381,7 +381,7 @@ fn kind(kind: Kind) -> &'static str {
 }
 
 /// Text without the markers that begin or end a C comment.
-fn comment(text: &str) -> String {
+pub(super) fn comment(text: &str) -> String {
     text.replace("*/", "* /").replace("/*", "/ *").replace(['\n', '\r'], " ")
 }
 
@@ -442,7 +442,7 @@ impl Names {
 }
 
 /// A C identifier: ASCII letters and digits stay, Greek letters are spelled out, all others become underscores.
-fn identifier(path: &str) -> String {
+pub(super) fn identifier(path: &str) -> String {
     const GREEK: [(char, &str); 12] = [
         ('α', "alpha"),
         ('β', "beta"),

@@ -1,8 +1,8 @@
 //! Code generation: machine code and C from the straight-line functions of the IR.
 //!
 //! In: functions that [`opt`](crate::opt) has optimised and [`math`](crate::math) has expanded to arithmetic. Out:
-//! machine code in the memory of this process, an image for another processor, or C source. Every back end returns the
-//! same bits as [`ir::interpret`](crate::ir::interpret); the tests in `agreement` check that. Only `emit`,
+//! machine code in the memory of this process, an image for another processor, or C source. Every back end but `python`
+//! returns the same bits as [`ir::interpret`](crate::ir::interpret); the tests in `agreement` check that. Only `emit`,
 //! `emit_f64x2`, `target`, `jit` and `executable_memory` know Cranelift.
 //!
 //! ```text
@@ -11,6 +11,7 @@
 //!   passes            the list of all passes over control-flow graphs, in order
 //! lanes               isel → schedule → regalloc → assembler, or emit_f64x2 → Cranelift
 //! c                   C source, directly from the expanded functions
+//! python              Python source of derivatives and outputs for other libraries, within rounding
 //! ```
 
 pub mod unsupported;
@@ -38,6 +39,7 @@ pub mod lanes;
 pub mod jit;
 pub mod image;
 pub mod c;
+pub mod python;
 pub mod tiering;
 pub mod pass_report;
 pub mod elementary;
