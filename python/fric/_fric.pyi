@@ -5,7 +5,26 @@ from typing import Any, final
 import numpy as np
 import numpy.typing as npt
 
-__all__: list[str]
+__all__ = [
+    "Batch",
+    "Native",
+    "Run",
+    "Stepper",
+    "SweepRows",
+    "Text",
+    "__version__",
+    "arrow_stream",
+    "command",
+    "curve_svg",
+    "in_unit",
+    "library_model",
+    "library_models",
+    "nearest",
+    "quantity",
+    "si_unit",
+    "sweep_plan",
+    "sweep_unit",
+]
 __version__: str
 
 _Files = list[tuple[str, str, str, str]]

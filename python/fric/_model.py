@@ -247,7 +247,7 @@ def _reporter(progress: bool | Progress | None) -> Progress | None:
     if callable(progress):
         return progress
     try:
-        from tqdm.auto import tqdm
+        from tqdm.auto import tqdm  # type: ignore
     except ImportError:
         import sys
 
@@ -272,7 +272,7 @@ class Model:
         self._values = _values.settings(dict(arguments), known)
         rows = text._inner.describe(name, self._settings()) if self._values else bare
         self._quantities = [
-            (kind, Quantity(path, unit, tuple(within), default, doc, si, boolean))
+            (kind, Quantity(path, unit, (within[0], within[1]), default, doc, si, boolean))
             for kind, path, unit, si, within, default, boolean, doc in rows
         ]
 
@@ -483,8 +483,10 @@ class Model:
             return value
 
         given = [(path, text(path, value)) for path, value in (at or {}).items()]
-        names = [_names("inputs", inputs) or [], _names("outputs", outputs) or [], _names("params", params) or []]
-        return Linear(json.loads(self._text._inner.linearise(self.name, self._settings(), *names, given, None, rest)))
+        ins, outs = _names("inputs", inputs) or [], _names("outputs", outputs) or []
+        moved = _names("params", params) or []
+        found = self._text._inner.linearise(self.name, self._settings(), ins, outs, moved, given, None, rest)
+        return Linear(json.loads(found))
 
     def curve(
         self,
@@ -711,7 +713,7 @@ class Run:
 
     def to_pandas(self) -> Any:
         """A table of pandas with the columns of ``fric run --data``: time in s, ``x [mm]``."""
-        import pandas
+        import pandas  # type: ignore
 
         columns = {f"{label} [{unit}]" if unit else label: self.in_unit(label) for label, unit in self.units.items()}
         return pandas.DataFrame({"t [s]": self.t, **columns})

@@ -106,7 +106,7 @@ class Table:
 
     def to_pandas(self) -> Any:
         """The table as a DataFrame."""
-        import pandas
+        import pandas  # type: ignore
 
         if self.path is not None and self.path.suffix != ".csv":
             if self.path.is_dir():

@@ -50,6 +50,7 @@ class _Plan:
             inner = model.text._inner
             name, _ = inner.source()
             text = inner.extended(model.name, "\n".join(lines))
+            assert text is not None, "the model is one of the text"
             model = Text(_fric.Text(name, text, inner.files())).model(model.name, **model._values)
         self.model, self.reward, self.done = model, reward, done
         self.action, self.observe = list(action), list(observe)
@@ -141,7 +142,7 @@ class Env(gymnasium.Env):
                 if path not in state:
                     raise unknown("state", path, paths)
                 state[path] = _values.number(path, value, self._plan.model.states[path].si)
-            self._stepper.state = list(state.values())
+            self._stepper.state = np.array(list(state.values()), dtype=float)
         self._steps = 0
         self._seen = self._observed()
         return self._seen, {}
