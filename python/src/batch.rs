@@ -3,7 +3,7 @@
 use crate::arrays;
 use crate::raise;
 use crate::stepper::{Plan, Started, names_of};
-use crate::watched::guarded;
+use crate::watched::{self, guarded, in_place};
 use abi::description::{Guard, Kind};
 use abi::lanes::Lanes;
 use abi::{Description, Instance, Slot};
@@ -16,6 +16,7 @@ use pyo3::types::{PyBytes, PyDict, PyTuple};
 use runtime::engine;
 use std::collections::BTreeMap;
 use std::sync::Arc;
+use std::sync::atomic::Ordering;
 
 /// Rows of a tile: what is transposed at once, so that it stays in the nearest cache.
 const TILE: usize = 64;
@@ -92,10 +93,13 @@ struct Part<'a> {
 }
 
 impl Job<'_> {
-    fn go(&self, part: Part) {
+    /// `goes_on`: asked after every some steps; if it is false, the rest is left out.
+    fn go(&self, part: Part, goes_on: &dyn Fn() -> bool) {
         match part.group {
-            Group::Lanes(batch) => self.in_lanes(batch, part.stopped, part.starts, part.given, part.taken),
-            Group::Alone(instances) => self.alone(instances, part.stopped, part.starts, part.given, part.taken),
+            Group::Lanes(batch) => self.in_lanes(batch, part.stopped, part.starts, (part.given, part.taken), goes_on),
+            Group::Alone(instances) => {
+                self.alone(instances, part.stopped, part.starts, (part.given, part.taken), goes_on)
+            }
         }
     }
 
@@ -119,8 +123,8 @@ impl Job<'_> {
         batch: &mut abi::lanes::Batch,
         stopped: &mut [Stopped],
         starts: &[u32],
-        given: &[f64],
-        taken: &mut [f64],
+        (given, taken): (&[f64], &mut [f64]),
+        goes_on: &dyn Fn() -> bool,
     ) {
         let (width, n, m) = (batch.width(), self.inputs.len(), self.outputs.len());
         let wide = self.columns.len();
@@ -133,7 +137,7 @@ impl Job<'_> {
         let mut ends = vec![0; used];
         let mut runs = vec![true; used];
         let mut again = vec![false; width];
-        for begin in (0..self.rows).step_by(TILE) {
+        for begin in (0..self.rows).step_by(TILE).take_while(|_| goes_on()) {
             let rows = TILE.min(self.rows - begin);
             if begin == 0 || self.per_row > 0 {
                 let of = |lane: usize| &given[lane.min(used - 1) * self.per_instance + begin * self.per_row..];
@@ -222,12 +226,15 @@ impl Job<'_> {
         instances: &mut [Instance],
         stopped: &mut [Stopped],
         starts: &[u32],
-        given: &[f64],
-        taken: &mut [f64],
+        (given, taken): (&[f64], &mut [f64]),
+        goes_on: &dyn Fn() -> bool,
     ) {
         let m = self.outputs.len();
         for (i, (instance, stop)) in instances.iter_mut().zip(stopped).enumerate() {
             for row in 0..self.rows {
+                if row % TILE == 0 && !goes_on() {
+                    return;
+                }
                 if stop.is_none() {
                     let from = &given[i * self.per_instance + row * self.per_row..];
                     self.inputs.iter().zip(from).for_each(|(slot, x)| instance.set(*slot, *x));
@@ -684,23 +691,25 @@ impl Batch {
                 Part { group, stopped, starts, given: &given[(k * width * per.0).min(end)..end], taken }
             })
             .collect();
-        let work = || match threads {
-            0 | 1 => parts.into_iter().for_each(|part| job.go(part)),
+        match threads {
+            0 | 1 => in_place(py, |goes_on| parts.into_iter().for_each(|part| job.go(part, goes_on)))?,
             _ => {
                 let queue = std::sync::Mutex::new(parts.into_iter());
                 let next = || queue.lock().unwrap_or_else(std::sync::PoisonError::into_inner).next();
-                std::thread::scope(|scope| {
-                    for _ in 0..threads {
-                        scope.spawn(|| {
-                            while let Some(part) = next() {
-                                job.go(part);
-                            }
-                        });
-                    }
-                });
+                watched::watched(py, None, |progress| {
+                    let goes_on = || !progress.stop().load(Ordering::Relaxed);
+                    std::thread::scope(|scope| {
+                        for _ in 0..threads {
+                            scope.spawn(|| {
+                                while let Some(part) = next() {
+                                    job.go(part, &goes_on);
+                                }
+                            });
+                        }
+                    });
+                })?;
             }
-        };
-        guarded(py, || py.detach(work))?;
+        }
         drop(write);
         match out {
             Some(out) => Ok(out),

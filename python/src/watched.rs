@@ -3,6 +3,7 @@
 use crate::raise;
 use pyo3::prelude::*;
 use runtime::engine::Continue;
+use std::cell::{Cell, RefCell};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::mpsc::{RecvTimeoutError, channel};
@@ -108,6 +109,33 @@ pub fn in_parts(py: Python, count: u64, mut part: impl FnMut(u64, u64) -> (u64, 
         if begin.elapsed() < LOOK / 8 {
             some *= 4;
         }
+    }
+}
+
+/// Does work in this thread while others of Python run. The work asks at least every millisecond or so whether to go on;
+/// Ctrl-C ends it.
+pub fn in_place<T: Send>(py: Python, work: impl FnOnce(&dyn Fn() -> bool) -> T + Send) -> PyResult<T> {
+    let done = py.detach(|| {
+        let (raised, next) = (RefCell::new(None), Cell::new(Instant::now() + LOOK));
+        let goes_on = || {
+            if raised.borrow().is_some() {
+                return false;
+            }
+            let now = Instant::now();
+            if now < next.get() {
+                return true;
+            }
+            next.set(now + LOOK);
+            *raised.borrow_mut() = Python::attach(|py| py.check_signals()).err();
+            raised.borrow().is_none()
+        };
+        let done = catch_unwind(AssertUnwindSafe(|| work(&goes_on)));
+        (raised.into_inner(), done)
+    });
+    match done {
+        (Some(error), _) => Err(error),
+        (None, Ok(done)) => Ok(done),
+        (None, Err(why)) => Err(raise::internal(py, &words(&*why))),
     }
 }
 

@@ -15,6 +15,7 @@ import random
 import signal
 import subprocess
 import sys
+import threading
 import time
 import tracemalloc
 
@@ -209,29 +210,55 @@ def test_held_inputs_jump_at_their_instants(solver, step, seed):
 
 INTERRUPTED = """
 import sys, time, fric
-text = fric.loads("model M { input u [1]  state x [1] = 0  dx/dt = (sin(u) - x) / 1 s }  experiment e { run M(u = 1) for 1e6 s  solver rk4 step 10 us }")
-model = text.model("M")
-s = model.start(step="10 us", method="rk4", outputs=["x"])
-print("ready", flush=True)
-try:
-    {call}
-except KeyboardInterrupt:
-    print("stopped", repr(time.clock_gettime(time.CLOCK_MONOTONIC)), flush=True)
+import numpy as np
+text = fric.loads("model M { input u [1]  param k = 1  state x [1] = 0  dx/dt = (sin(u) - k * x) / 1 s }  experiment e { run M(u = 1) for 1e6 s  solver rk4 step 10 us }")
+model, how = text.model("M"), {"step": "10 us", "method": "rk4", "outputs": ["x"]}
+s, slow = model.start(**how), model.start(interpret=True, **how)
+rows, many = np.zeros(4_000_000), np.zeros((64, 100_000))
+batch = {(n, i): model.batch(64, threads=n, interpret=i, **how) for n in (1, 2) for i in (False, True)}
+for _ in range(8):
+    print("ready", flush=True)
+    try:
+        {call}
+        print("ended", time.clock_gettime(time.CLOCK_MONOTONIC), flush=True)
+    except KeyboardInterrupt:
+        print("stopped", repr(time.clock_gettime(time.CLOCK_MONOTONIC)), flush=True)
 """
 
 
-@pytest.mark.parametrize("call", ["s.hold(10**12, 1.0)", 'text.run("e")'])
-def test_ctrl_c_ends_long_calls(call):
-    """Within 50 ms on an idle machine; the bound is wider, because others may load it."""
+@pytest.mark.parametrize(
+    "call",
+    [
+        "s.hold(10**12, 1.0)", "slow.follow(rows)", 'text.run("e")', 'text.run("e", errors=False, every="100 s")',
+        'model.simulate(1e6, inputs={"u": 1.0}, solver="rk4", step="10 us")',
+        "batch[1, False].hold(10**9, many[:, 0])", "batch[2, False].hold(10**9, many[:, 0])",
+        "batch[1, True].follow(many)", "batch[2, True].follow(many)", 'fric.sweep(text, "e", vary={"k": [1.0, 2.0, 3.0]})',
+    ],
+)  # fmt: skip
+def test_ctrl_c_ends_long_calls_within_50_ms(call):
+    """Once of eight times: others may load the machine."""
     with subprocess.Popen(
-        [sys.executable, "-c", INTERRUPTED.replace("{call}", call)], stdout=subprocess.PIPE, text=True
+        [sys.executable, "-c", INTERRUPTED.replace("{call}", call)], stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True
     ) as child:
-        assert child.stdout.readline() == "ready\n"
-        time.sleep(0.7)
-        begin = time.clock_gettime(time.CLOCK_MONOTONIC)
-        child.send_signal(signal.SIGINT)
-        word, at = child.communicate(timeout=60)[0].split()
-        assert word == "stopped" and float(at) - begin < 2.0, float(at) - begin
+        # A call that does not end is killed, and its line is empty.
+        late = threading.Timer(60, child.kill)
+        late.start()
+        taken = []
+        for _ in range(8):
+            assert child.stdout.readline() == "ready\n"
+            time.sleep(0.15)
+            begin = time.clock_gettime(time.CLOCK_MONOTONIC)
+            child.send_signal(signal.SIGINT)
+            told = child.stdout.readline().split()
+            if told[:1] != ["stopped"]:
+                break
+            at = told[1]
+            taken.append(float(at) - begin)
+            if taken[-1] < 0.05:
+                break
+        late.cancel()
+        child.kill()
+    assert taken and min(taken) < 0.05 and told[:1] == ["stopped"], (taken, told)
 
 
 def anything(chance):
