@@ -34,8 +34,8 @@ const MASS: usize = 1;
 /// Step in s.
 const H: f64 = 1e-5;
 /// Steps of a run.
-const STEPS: u64 = 4096;
-const ROUNDS: usize = 51;
+const STEPS: u64 = 65_536;
+const ROUNDS: usize = 21;
 
 /// What a sweep measures: the name of the row, and its statements.
 const MEASURED: [(&str, &str); 4] = [
@@ -175,6 +175,9 @@ fn one(method: Method, scalar: &Library) {
     for (name, ns) in names.chain(swept).zip(&medians[1..]) {
         println!("  {name:<44} {ns:6.2} ns, {:.4}; to intrinsics {:.2}", ns / gcc, ns / medians[1]);
     }
+    let swept = &medians[medians.len() - cases.len()..];
+    let mean = swept.iter().map(|ns| (ns / gcc).ln()).sum::<f64>() / swept.len() as f64;
+    println!("  {:<44} {:9} {:.4} (geometric mean)", "all sweeps", "", mean.exp());
 }
 
 /// The model alone, with all its guards.

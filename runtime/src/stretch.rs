@@ -4,6 +4,31 @@
 
 use abi::Slot;
 
+/// Compiles a function for vectors of four numbers too, which it takes where the processor has them. The bits are the same:
+/// nothing is fused or reordered.
+macro_rules! in_vectors {
+    ($(#[$doc:meta])* $vis:vis fn $name:ident($($arg:ident: $type:ty),*) $(-> $result:ty)? $body:block) => {
+        $(#[$doc])*
+        $vis fn $name($($arg: $type),*) $(-> $result)? {
+            #[inline(always)]
+            fn any($($arg: $type),*) $(-> $result)? $body
+            #[cfg(target_arch = "x86_64")]
+            {
+                #[target_feature(enable = "avx2")]
+                fn wide($($arg: $type),*) $(-> $result)? {
+                    any($($arg),*)
+                }
+                if std::is_x86_feature_detected!("avx2") {
+                    // SAFETY: the processor has the vectors.
+                    return unsafe { wide($($arg),*) };
+                }
+            }
+            any($($arg),*)
+        }
+    };
+}
+pub(crate) use in_vectors;
+
 /// Points in order of time.
 #[derive(Default)]
 pub(crate) struct Stretch {
@@ -12,24 +37,47 @@ pub(crate) struct Stretch {
     slots: Vec<Slot>,
     /// Column by column, SI.
     values: Vec<f64>,
+    /// Of each column.
+    bounds: Vec<Bounds>,
+    is_finite: bool,
+}
+
+/// The least and the greatest of some values, SI; ∞ and −∞ of none.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Bounds {
+    pub(crate) least: f64,
+    pub(crate) greatest: f64,
+}
+
+impl Bounds {
+    /// The greatest magnitude.
+    pub(crate) fn magnitude(self) -> f64 {
+        self.least.abs().max(self.greatest.abs())
+    }
 }
 
 impl Stretch {
-    /// Replaces the points by those at these times. `column` writes the values of the slot with a given number.
+    /// Replaces the points by so many. `times` writes their times, `column` the values of the slot with a given number.
     pub(crate) fn fill(
         &mut self,
-        times: impl Iterator<Item = f64>,
+        len: usize,
+        times: &dyn Fn(&mut [f64]),
         slots: &[Slot],
         column: &dyn Fn(usize, &mut [f64]),
     ) {
-        self.times.clear();
-        self.times.extend(times);
+        self.times.resize(len, 0.0);
+        times(&mut self.times);
         self.slots.clear();
         self.slots.extend(slots);
-        let len = self.times.len();
         self.values.resize(len * slots.len(), 0.0);
+        self.bounds.clear();
+        self.is_finite = true;
         for k in 0..slots.len() {
-            column(k, &mut self.values[k * len..][..len]);
+            let values = &mut self.values[k * len..][..len];
+            column(k, values);
+            let (bounds, is_finite) = bounds(values);
+            self.bounds.push(bounds);
+            self.is_finite &= is_finite;
         }
     }
 
@@ -48,11 +96,19 @@ impl Stretch {
     /// # Panics
     /// If the stretch does not have it: a bug in the caller.
     pub(crate) fn column(&self, slot: Slot) -> &[f64] {
-        if slot == Slot::TIME {
-            return &self.times;
-        }
-        let at = self.slots.iter().position(|known| *known == slot);
-        &self.values[at.expect("a column for each slot that is read") * self.len()..][..self.len()]
+        if slot == Slot::TIME { &self.times } else { &self.values[self.place(slot) * self.len()..][..self.len()] }
+    }
+
+    /// The bounds of that column, if all its values are finite.
+    ///
+    /// # Panics
+    /// As [`column`](Stretch::column).
+    pub(crate) fn bounds(&self, slot: Slot) -> Bounds {
+        if slot == Slot::TIME { bounds(&self.times).0 } else { self.bounds[self.place(slot)] }
+    }
+
+    fn place(&self, slot: Slot) -> usize {
+        self.slots.iter().position(|known| *known == slot).expect("a column for each slot that is read")
     }
 
     /// Writes the values of one point to a block, but not its time.
@@ -64,8 +120,7 @@ impl Stretch {
 
     /// Whether all values are finite.
     pub(crate) fn is_finite(&self) -> bool {
-        // Zero times a value is zero unless the value is infinite or not a number.
-        reduced(&self.values, 0.0, |value| 0.0 * value, |sum, zero| sum + zero) == 0.0
+        self.is_finite
     }
 }
 
@@ -76,25 +131,46 @@ pub(crate) fn copy_column(rows: &[f64], stride: usize, column: &mut [f64]) {
     }
 }
 
-/// The greatest `of` some finite values, −∞ of none.
-pub(crate) fn greatest(values: &[f64], of: impl Fn(f64) -> f64) -> f64 {
-    reduced(values, f64::NEG_INFINITY, of, |most, value| if value > most { value } else { most })
+in_vectors! {
+    /// Writes the products of a step and the counts from `first` on.
+    pub(crate) fn multiples(first: f64, step: f64, to: &mut [f64]) {
+        // Vectors convert 32 bits.
+        to.iter_mut().zip(0_u32..).for_each(|(to, count)| *to = (first + f64::from(count)) * step);
+    }
 }
 
-/// Combines what is `of` each value, where order and grouping do not matter: in eight partial results, as vectors compute
-/// them.
-fn reduced(values: &[f64], none: f64, of: impl Fn(f64) -> f64, add: impl Fn(f64, f64) -> f64) -> f64 {
-    let mut all = [none; 8];
-    let (eights, rest) = values.as_chunks::<8>();
-    for eight in eights {
-        for (one, value) in all.iter_mut().zip(eight) {
-            *one = add(*one, of(*value));
+in_vectors! {
+    /// The bounds of some values, and whether all are finite; if not, the bounds mean nothing.
+    fn bounds(values: &[f64]) -> (Bounds, bool) {
+        // Order and grouping do not matter, so that there may be eight partial results.
+        let (mut least, mut greatest, mut zero) = ([f64::INFINITY; 8], [f64::NEG_INFINITY; 8], [0.0; 8]);
+        let (eights, rest) = values.as_chunks::<8>();
+        let mut see = |k: usize, value: f64| {
+            least[k] = if value < least[k] { value } else { least[k] };
+            greatest[k] = if value > greatest[k] { value } else { greatest[k] };
+            // Zero times a value is zero unless the value is infinite or not a number.
+            zero[k] += 0.0 * value;
+        };
+        for eight in eights {
+            (0..8).for_each(|k| see(k, eight[k]));
         }
+        rest.iter().enumerate().for_each(|(k, value)| see(k, *value));
+        let least = least.into_iter().fold(f64::INFINITY, f64::min);
+        let greatest = greatest.into_iter().fold(f64::NEG_INFINITY, f64::max);
+        (Bounds { least, greatest }, zero.into_iter().sum::<f64>() == 0.0)
     }
-    for (one, value) in all.iter_mut().zip(rest) {
-        *one = add(*one, of(*value));
+}
+
+in_vectors! {
+    /// The index of the first value that equals one of them.
+    ///
+    /// # Panics
+    /// If none does.
+    pub(crate) fn first(values: &[f64], one: f64) -> usize {
+        let lacks = |block: &[f64]| block.iter().fold(true, |lacks, value| lacks & (*value != one));
+        let begin = 16 * values.chunks_exact(16).take_while(|block| lacks(block)).count();
+        begin + values[begin..].iter().position(|value| *value == one).expect("it is one of them")
     }
-    all.into_iter().fold(none, add)
 }
 
 #[cfg(test)]
@@ -208,7 +284,8 @@ mod tests {
                         *to = [point.1, point.2][slot];
                     }
                 };
-                stretch.fill(points.iter().map(|point| point.0), &[VALUE, OTHER], &column);
+                let times = |to: &mut [f64]| to.iter_mut().zip(points).for_each(|(to, point)| *to = point.0);
+                stretch.fill(points.len(), &times, &[VALUE, OTHER], &column);
                 all.see_stretch(&stretch);
                 rest = later;
             }
@@ -238,9 +315,9 @@ mod tests {
         for (len, bad) in [(1, 0), (8, 7), (17, 16), (64, 40)] {
             for value in [f64::NAN, f64::INFINITY, f64::NEG_INFINITY] {
                 let mut stretch = Stretch::default();
-                stretch.fill((0..len).map(|k| k as f64), &[VALUE], &|_, to| to.fill(f64::MAX));
+                stretch.fill(len, &|times| multiples(0.0, 1.0, times), &[VALUE], &|_, to| to.fill(f64::MAX));
                 assert!(stretch.is_finite());
-                stretch.fill((0..len).map(|k| k as f64), &[VALUE], &|_, to| to[bad] = value);
+                stretch.fill(len, &|times| multiples(0.0, 1.0, times), &[VALUE], &|_, to| to[bad] = value);
                 assert!(!stretch.is_finite(), "{value} at {bad} of {len}");
             }
         }

@@ -3,7 +3,7 @@
 use crate::run::observe::{Observer, check_finite, check_status};
 use crate::run::outcome::{Cause, Continue, Stop};
 use crate::run::stepper::{Rest, Stepper};
-use crate::stretch::Stretch;
+use crate::stretch::{Stretch, multiples};
 use abi::format;
 use abi::plan::Experiment;
 use abi::table::keep_time;
@@ -13,7 +13,7 @@ use std::ops::Range;
 /// Steps between two calls of the progress callback and two checks of the whole block.
 const BATCH: u64 = 4096;
 /// Most steps in one call if an observer needs every step: their values fit into the nearest cache.
-const SERIES: u64 = 64;
+const SERIES: u64 = 128;
 
 /// A fixed-step run in progress.
 pub(crate) struct Fixed {
@@ -174,17 +174,17 @@ impl Stepper for Fixed {
     fn show(&mut self, calls: u64, column: &dyn Fn(usize, &mut [f64])) -> Result<(), Stop> {
         let Rest { instance, observer, work, .. } = &mut self.rest;
         // The block may be that before the calls or after them.
-        let count = (work.steps + self.done) as f64;
-        let counts = (1..=calls).map(|call| count + call as f64);
-        self.stretch.fill(counts.clone().map(|count| count * self.step), &self.series, column);
+        let (first, step) = ((work.steps + self.done + 1) as f64, self.step);
+        let times = |times: &mut [f64]| multiples(first, step, times);
+        self.stretch.fill(calls as usize, &times, &self.series, column);
         if self.stretch.is_finite() {
             observer.see_stretch(&self.stretch);
             return Ok(());
         }
-        for (point, count) in counts.enumerate() {
+        for point in 0..self.stretch.len() {
             let block = instance.block_mut();
             self.stretch.write(point, block);
-            block[Slot::COUNT.index()] = count;
+            block[Slot::COUNT.index()] = first + point as f64;
             keep_time(block);
             observer.see(instance)?;
         }

@@ -9,9 +9,9 @@
 use crate::run::crossing::{Lobes, period, settling};
 use crate::run::hills::{Hills, Turn};
 use crate::run::peak::{Peak, Point};
-use crate::run::quadrature::{Even, Sum};
+use crate::run::quadrature::{Even, Sum, Sums};
 use crate::run::verdict::{self, Reading, Verdict};
-use crate::stretch::{Stretch, greatest};
+use crate::stretch::{Bounds, Stretch};
 use abi::Slot;
 use abi::format;
 use abi::plan::{Edge, Expect, Measure, MeasureKind, Moment};
@@ -206,7 +206,7 @@ enum Tally {
     Sum {
         square: bool,
         kind: Average,
-        sum: Sum,
+        sum: Sums,
         given: bool,
         even: Even,
     },
@@ -308,7 +308,7 @@ impl Meter {
         let extremes = |kind| Tally::Extremes { min: Peak::least(), max: Peak::greatest(), kind };
         let at_peak = |peak| Tally::AtPeak { peak, found: 0.0, near: (0.0, None) };
         let sum = |kind, square| {
-            let (sum, even) = (Sum::default(), Even::default());
+            let (sum, even) = (Sums::default(), Even::default());
             Tally::Sum { square, kind, sum, given: false, even }
         };
         let count = |of| Tally::Count { of, count: 0, time: None };
@@ -410,22 +410,22 @@ impl Meter {
                 let other = |slot| others.iter().flatten().find(|(known, _)| *known == slot).map(|(_, all)| all[k]);
                 self.see_with(*t, |slot| other(slot).unwrap_or(*v));
             }
-        } else if !self.count_all(times, values) {
+        } else if !self.count_all(times, values, stretch.bounds(self.slot)) {
             times.iter().zip(values).for_each(|(t, v)| self.see(*t, *v));
         }
     }
 
     /// Adds points inside the window, of which it has counted some, in a closed form or a loop of its own; returns whether
     /// there is one for this measure.
-    fn count_all(&mut self, times: &[f64], values: &[f64]) -> bool {
+    fn count_all(&mut self, times: &[f64], values: &[f64], bounds: Bounds) -> bool {
         let (Some(t), Some(v)) = (times.last(), values.last()) else { return true };
         match &mut self.tally {
             Tally::Extremes { min, max, kind } => {
                 if !matches!(kind, Extreme::Max) {
-                    min.see_all(times, values);
+                    min.see_all(times, values, bounds);
                 }
                 if !matches!(kind, Extreme::Min) {
-                    max.see_all(times, values);
+                    max.see_all(times, values, bounds);
                 }
             }
             Tally::Sum { given: false, square, sum, even, .. } => {
@@ -433,22 +433,17 @@ impl Meter {
                     return false;
                 }
                 let of = |v: f64| if *square { v * v } else { v };
-                let (mut t0, mut before) = (self.end.0, of(self.end.1));
-                for (t, v) in times.iter().zip(values) {
-                    let value = of(*v);
-                    sum.add(0.5 * (before + value) * (t - t0));
-                    (t0, before) = (*t, value);
-                }
+                sum.add_trapezoids(self.end, times, values, *square);
                 even.push_all(*t, values.len(), values[values.len().saturating_sub(3)..].iter().map(|v| of(*v)));
             }
             Tally::Sum { given: true, .. } | Tally::Final => {}
             Tally::At { instant, .. } if *t < *instant || *instant < self.end.0 => {}
-            Tally::TimeOf { peak } => peak.see_all(times, values),
+            Tally::TimeOf { peak } => peak.see_all(times, values, bounds),
             _ => return false,
         }
         self.end = (*t, *v);
         self.last = self.end;
-        self.scale = self.scale.max(greatest(values, f64::abs));
+        self.scale = self.scale.max(bounds.magnitude());
         true
     }
 

@@ -5,7 +5,7 @@
 //! extrapolated from both sides. A run with half the step has a point at the same time, so its agreement there gives no
 //! information about the signal in between.
 
-use crate::stretch::greatest;
+use crate::stretch::{Bounds, first};
 
 /// A point: time in s, value in SI.
 pub(crate) type Point = (f64, f64);
@@ -46,13 +46,13 @@ impl Peak {
         higher
     }
 
-    /// Adds points one after the other, as [`see`](Peak::see) does. Values must be finite.
-    pub(crate) fn see_all(&mut self, times: &[f64], values: &[f64]) {
+    /// Adds points with these bounds one after the other, as [`see`](Peak::see) does. Values must be finite.
+    pub(crate) fn see_all(&mut self, times: &[f64], values: &[f64], bounds: Bounds) {
         let at = |k: usize| (times[k], self.sign * values[k]);
         let len = values.len();
-        let highest = greatest(values, |value| self.sign * value);
+        let highest = if self.sign > 0.0 { bounds.greatest } else { -bounds.least };
         if highest > self.at.1 {
-            let k = values.iter().position(|value| self.sign * value == highest).expect("it is one of them");
+            let k = first(values, self.sign * highest);
             // The points before one of these, later one first.
             let before = |k: usize| match k {
                 0 => self.last,

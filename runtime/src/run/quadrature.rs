@@ -3,6 +3,9 @@
 //! In: points in order of time. Out: the trapezoidal sum with compensated summation, and its end corrections where
 //! points are equidistant. Knows no windows.
 
+use crate::run::peak::Point;
+use crate::stretch::in_vectors;
+
 /// A sequence of equidistant points: its first and last values, for Gregory's end corrections, which raise the
 /// trapezoidal rule to order four,
 ///
@@ -47,12 +50,11 @@ impl Even {
 
     /// Whether these times in s continue the sequence, so that adding their points gives no correction.
     pub(crate) fn goes_on(&self, times: &[f64]) -> bool {
-        // A loop without branches, for vectors.
-        let next = |last: f64, t: f64| u64::from(is_even(t - last, self.step, t));
-        let inside: u64 = times.windows(2).map(|pair| next(pair[0], pair[1])).sum();
         match times {
             [] => true,
-            [first, rest @ ..] => self.points >= 3 && next(self.last, *first) + inside == 1 + rest.len() as u64,
+            [first, ..] => {
+                self.points >= 3 && is_even(first - self.last, self.step, *first) && are_even(times, self.step)
+            }
         }
     }
 
@@ -79,6 +81,13 @@ fn is_even(step: f64, others: f64, t: f64) -> bool {
     (step - others).abs() <= 1e-9 * others + 8.0 * f64::EPSILON * t.abs()
 }
 
+in_vectors! {
+    /// Whether all these times in s have this distance. A loop without branches.
+    fn are_even(times: &[f64], step: f64) -> bool {
+        times.iter().zip(&times[1..]).fold(true, |all, (last, t)| all & is_even(t - last, step, *t))
+    }
+}
+
 /// A compensated sum (Neumaier, 1974): rounding errors stay negligible over ten million steps.
 #[derive(Default, Clone, Copy)]
 pub(crate) struct Sum {
@@ -98,6 +107,62 @@ impl Sum {
     }
 }
 
+/// A compensated sum of many terms, in partial sums that take turns: vectors add to several at once.
+#[derive(Default, Clone, Copy)]
+pub(crate) struct Sums {
+    parts: [Sum; PARTS],
+    /// Whose turn it is.
+    next: usize,
+}
+
+const PARTS: usize = 8;
+
+impl Sums {
+    pub(crate) fn add(&mut self, term: f64) {
+        self.parts[self.next].add(term);
+        self.next = (self.next + 1) % PARTS;
+    }
+
+    /// Adds the areas of the trapezoids between consecutive points, the first of which is `from`: as
+    /// [`add`](Sums::add) for one after the other. `square`: below the square of the values.
+    pub(crate) fn add_trapezoids(&mut self, from: Point, times: &[f64], values: &[f64], square: bool) {
+        let len = times.len();
+        let of = |v: f64| if square { v * v } else { v };
+        let term = |k: usize| {
+            let (t, v) = if k == 0 { from } else { (times[k - 1], values[k - 1]) };
+            0.5 * (of(v) + of(values[k])) * (times[k] - t)
+        };
+        // Up to the first point and to the turn of the first part; then eight at a time, and the others.
+        let head = len.min(1 + (2 * PARTS - 1 - self.next) % PARTS);
+        (0..head).for_each(|k| self.add(term(k)));
+        if head > 0 {
+            let eights = (len - head) / PARTS * PARTS;
+            add_in_turn(&mut self.parts, &times[head - 1..][..=eights], &values[head - 1..][..=eights], square);
+            (head + eights..len).for_each(|k| self.add(term(k)));
+        }
+    }
+
+    pub(crate) fn total(&self) -> f64 {
+        let mut all = Sum::default();
+        self.parts.iter().for_each(|part| all.add(part.total()));
+        all.total()
+    }
+}
+
+in_vectors! {
+    /// Adds the trapezoids between consecutive points to the parts in turn; their number is a multiple of that of the parts.
+    fn add_in_turn(parts: &mut [Sum; PARTS], times: &[f64], values: &[f64], square: bool) {
+        let of = |v: f64| if square { v * v } else { v };
+        let before = times.as_chunks::<PARTS>().0.iter().zip(values.as_chunks::<PARTS>().0);
+        let here = times[1..].as_chunks::<PARTS>().0.iter().zip(values[1..].as_chunks::<PARTS>().0);
+        for ((t0, v0), (t, v)) in before.zip(here) {
+            for k in 0..PARTS {
+                parts[k].add(0.5 * (of(v0[k]) + of(v[k])) * (t[k] - t0[k]));
+            }
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -107,5 +172,8 @@ mod tests {
         let mut sum = Sum::default();
         (0..10_000_000).for_each(|_| sum.add(0.1));
         assert_eq!(sum.total(), 1_000_000.0);
+        let mut sums = Sums::default();
+        (0..10_000_000).for_each(|_| sums.add(0.1));
+        assert_eq!(sums.total(), 1_000_000.0);
     }
 }
