@@ -4,8 +4,9 @@
 //! of position at 201 instants stays below 1e-6 or 1e-8 m. Times are the least of many, in processor time and not
 //! wall-clock time, interleaved in one run; only their ratios are meaningful. Needs gcc, and CVODE of SUNDIALS for that
 //! comparison; missing programs are reported. Then sweeps of hundreds of the same runs, each with another static
-//! friction force, where only the last position is needed: in lanes on one core, against the C program that makes one
-//! run after the other.
+//! friction force: in lanes on one core, against the C program that makes one run after the other and reports its last
+//! position. Ours are measured with that position alone, and with an extreme and an integral, for which they locate turning
+//! points and evaluate the dense output.
 
 #[path = "../clock.rs"]
 mod clock;
@@ -27,6 +28,12 @@ const INSTANTS: usize = 200;
 const ROUNDS: usize = 15;
 /// Number of runs of the sweep.
 const RUNS: usize = 512;
+/// What a sweep measures besides the last position.
+const MEASURED: [(&str, &str); 3] = [
+    ("the last position", ""),
+    ("and max(v)", "  expect max(v) > -1 m/s"),
+    ("and max(v), rms(fr.F)", "  expect max(v) > -1 m/s  expect rms(fr.F) > 0 N"),
+];
 
 /// Seconds of a run, and positions.
 type Timed = (f64, Vec<f64>);
@@ -105,7 +112,9 @@ fn main() {
                 against_diffsol(name, program, &other, error, best_ours);
             }
         }
-        sweep(name, &rosenbrock, [tolerances[0], tolerances[1]]);
+        for measured in MEASURED {
+            sweep(name, measured, &rosenbrock, [tolerances[0], tolerances[1]]);
+        }
     }
 }
 
@@ -155,8 +164,10 @@ fn diffsol() -> Result<PathBuf, String> {
 }
 
 /// Many runs in lanes, each with another static friction force; in C one after the other.
-fn sweep(name: &str, rosenbrock: &Path, tolerances: [(f64, f64); 2]) {
-    let mut loaded = compiler::load("bench", TEXT, &NoSources);
+fn sweep(name: &str, (measured, expects): (&str, &str), rosenbrock: &Path, tolerances: [(f64, f64); 2]) {
+    let last = "expect final(x) > 0 m";
+    let text = TEXT.replace(last, &format!("{last}{expects}")).replace("  expect", "\n  expect");
+    let mut loaded = compiler::load("bench", &text, &NoSources);
     let changes = Changes { vary: vec!["fr.rise".into()], ..Changes::default() };
     let options = Options { changes, ..Options::default() };
     let varying = compiler::varying(&mut loaded, &NoSources, name, &options, &mut Vec::new());
@@ -208,7 +219,7 @@ fn sweep(name: &str, rosenbrock: &Path, tolerances: [(f64, f64); 2]) {
             }
         }
         println!(
-            "{name}, {RUNS} runs on one core, tol {tol_ours:.1e}, in C {tol_c:.1e}: last positions differ by {off:.1e} m; C \
+            "{name}, {RUNS} runs on one core, {measured}, tol {tol_ours:.1e}, in C {tol_c:.1e}: last positions differ by {off:.1e} m; C \
              {:.4} ms a run",
             1e3 * best_c
         );

@@ -56,6 +56,26 @@ impl Area {
     }
 }
 
+/// What the observers need of a slot between the ends of a step.
+struct Column {
+    /// Its number among the states, if it is one.
+    state: Option<usize>,
+    /// Whether it is recorded, or a measure interpolates between its points.
+    lines: bool,
+    /// Whether its turning points are located exactly.
+    turning: bool,
+    /// Allowed error of linear interpolation between two points, as a fraction of the span; at most [`BEND`].
+    bend: f64,
+}
+
+impl Column {
+    /// Whether the points at the ends of a part of a step show all of it.
+    fn needs_only_ends(&self, step: &Step, part: (f64, f64)) -> bool {
+        let turns = || self.state.is_none_or(|state| !step.is_monotonic(state, part));
+        !(self.lines || self.turning && turns())
+    }
+}
+
 /// The points shown so far.
 pub(crate) struct Points {
     observer: Observer,
@@ -69,8 +89,7 @@ pub(crate) struct Points {
     edges: Vec<f64>,
     edge: usize,
     areas: Vec<Area>,
-    /// Columns whose turning points are located exactly.
-    turning: Vec<bool>,
+    columns: Vec<Column>,
     /// Values at the seven nodes of an integral, row-major.
     nodes: Vec<f64>,
     /// θ of the last point shown, and of the ends of the part of the step that is being shown.
@@ -80,9 +99,6 @@ pub(crate) struct Points {
     rows: Vec<f64>,
     /// Least and greatest value of each slot.
     spans: Vec<(f64, f64)>,
-    /// Allowed error of linear interpolation between two points for measures, as a fraction of the span; at most
-    /// [`BEND`].
-    bend: f64,
     /// θ and column of each turning point between two points.
     turns: Vec<(f64, usize)>,
     /// A block in which only time and the observed slots are valid.
@@ -111,11 +127,21 @@ impl Points {
                 magnitude: (0.0, 0.0),
             })
         });
-        let turns = |slot: &usize| demands.iter().any(|d| d.what == Wants::Turns && d.slot.index() == *slot);
-        let lines = demands.iter().any(|demand| demand.what == Wants::Points);
+        let recorded: Vec<usize> = observer.recorder.slots().map(|slot| slot.index()).collect();
+        let columns = slots.iter().map(|slot| {
+            let wants = |what| demands.iter().any(|demand| demand.what == what && demand.slot.index() == *slot);
+            Column {
+                state: states.range().contains(slot).then(|| slot - states.range().start),
+                lines: wants(Wants::Points) || recorded.contains(slot),
+                turning: wants(Wants::Turns),
+                // Periods and the like use cubics through points, whose error is about the square of that of lines;
+                // integrals and extremes have their own error control.
+                bend: if wants(Wants::Points) { (1e-2 * tol.sqrt()).min(1e-5) } else { BEND },
+            }
+        });
         Points {
             areas: areas.collect(),
-            turning: slots.iter().map(turns).collect(),
+            columns: columns.collect(),
             nodes: vec![0.0; 7 * slots.len()],
             edges: observer.expectations.instants(),
             edge: 0,
@@ -126,9 +152,6 @@ impl Points {
             part: (0.0, 0.0),
             rows: vec![0.0; slots.len() * (DEPTH + 4)],
             spans: vec![(f64::INFINITY, f64::NEG_INFINITY); slots.len()],
-            // Periods and the like use cubics through points, whose error is about the square of that of lines; integrals
-            // and extremes have their own error control.
-            bend: if lines { (1e-2 * tol.sqrt()).min(1e-5) } else { BEND },
             turns: Vec::new(),
             block: instance.block().to_vec(),
             x: vec![0.0; instance.description().layout.states.len as usize],
@@ -211,6 +234,12 @@ impl Points {
         self.part = (from, theta);
         if !self.areas.is_empty() {
             self.area(system, step, (from, theta), MOST_HALVED)?;
+        }
+        if self.columns.iter().all(|column| column.needs_only_ends(step, (from, theta))) {
+            self.sample(system, step, 0, theta)?;
+            self.emit(0, time, true);
+            self.theta = theta;
+            return Ok(());
         }
         let pieces = (LEAST_POINTS * step.h * (theta - from) / self.duration).ceil().max(2.0);
         for piece in 1..=pieces as u32 {
@@ -323,12 +352,15 @@ impl Points {
         let (mut straight, mut looks_straight) = (true, true);
         self.turns.clear();
         for i in 0..width {
+            if !(self.columns[i].lines || self.columns[i].turning) {
+                continue;
+            }
             let [a, m, b] = [row_from, row, row_to].map(|row| self.rows[row * width + i]);
             let (low, high) = self.spans[i];
             let span = high.max(b) - low.min(b);
             let bend = a - 2.0 * m + b;
             let is_within = |part: f64| 0.5 * bend.abs() <= part * span + 1e-15 * m.abs();
-            straight &= is_within(self.bend);
+            straight &= is_within(self.columns[i].bend);
             looks_straight &= is_within(BEND);
             // On the parabola through the three points, with −1 at a and 1 at b.
             let turn = 0.5 * (a - b) / bend;
@@ -346,7 +378,7 @@ impl Points {
         }
         for k in 0..self.turns.len() {
             let (turn, column) = self.turns[k];
-            if self.turning[column] {
+            if self.columns[column].turning {
                 self.turns[k].0 = self.refine(system, step, (from, to), (turn, column))?;
             }
         }

@@ -191,6 +191,18 @@ impl Step {
         if theta == 1.0 { self.end } else { self.t + theta * self.h }
     }
 
+    /// Whether a state surely does not turn between two θ: the Bernstein coefficients of its derivative by θ, a polynomial of
+    /// degree three between whose least and greatest coefficient it lies, have one sign.
+    pub(crate) fn is_monotonic(&self, state: usize, (from, to): (f64, f64)) -> bool {
+        let [k1, k2, k3] = [&self.k1, &self.k2, &self.k3].map(|k| k[state]);
+        let slope = [self.x1[state] - self.x0[state] + k1, 2.0 * (k2 - k1), 3.0 * (k3 - k2), -4.0 * k3];
+        let coefficient = |[a, b, c]: [f64; 3]| {
+            slope[0] + slope[1] * (a + b + c) / 3.0 + slope[2] * (a * b + b * c + c * a) / 3.0 + slope[3] * (a * b * c)
+        };
+        let all = [[from; 3], [from, from, to], [from, to, to], [to; 3]].map(coefficient);
+        all.iter().all(|one| *one >= 0.0) || all.iter().all(|one| *one <= 0.0)
+    }
+
     /// States at θ.
     pub(crate) fn at(&self, theta: f64, x: &mut [f64]) {
         if theta == 1.0 {
@@ -202,5 +214,54 @@ impl Step {
             let bend = self.k1[i] + theta * (self.k2[i] + theta * self.k3[i]);
             *x = self.x0[i] + theta * (self.x1[i] - self.x0[i] + rest * bend);
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::rng::Chance;
+    use crate::testing::generated::{hold, seeds};
+
+    /// Numbers from −1 to 1 for a step of one state: where it ends, three coefficients, and the ends of a part.
+    fn case(seed: u64) -> [f64; 6] {
+        let mut chance = Chance(seed);
+        [(); 6].map(|()| chance.below(2001) as f64 / 1000.0 - 1.0)
+    }
+
+    /// Whether a part that turns is not found monotonic; gives whether it turns, and whether it is found.
+    fn holds(&[x1, k1, k2, k3, a, b]: &[f64; 6]) -> Result<(bool, bool), String> {
+        let [x1, k1, k2, k3] = [x1, k1, k2, k3].map(|one| vec![one]);
+        let step = Step { x1, k1, k2, k3, ..Step::new(1) };
+        let (from, to) = (0.5 + 0.5 * a.min(b), 0.5 + 0.5 * a.max(b));
+        let at = |k: usize| {
+            let mut x = [0.0];
+            step.at(from + (to - from) * k as f64 / 200.0, &mut x);
+            x[0]
+        };
+        let by: Vec<f64> = (0..200).map(|k| at(k + 1) - at(k)).collect();
+        let turns = by.iter().any(|by| *by < -1e-12) && by.iter().any(|by| *by > 1e-12);
+        match (turns, step.is_monotonic(0, (from, to))) {
+            (true, true) => Err(format!("it turns: {by:?}")),
+            other => Ok(other),
+        }
+    }
+
+    /// A mutant that looks at the slopes at the ends alone takes parts that turn twice for monotonic.
+    #[test]
+    fn a_part_that_turns_is_never_found_monotonic() {
+        let (mut plain, mut found) = (0, 0);
+        let failed = hold(
+            seeds(4000),
+            case,
+            holds,
+            |case, why| (*case, why),
+            |(turns, is_found)| {
+                plain += u64::from(!turns);
+                found += u64::from(is_found);
+            },
+        );
+        assert!(failed.is_empty(), "{failed:?}");
+        assert!(2 * found > plain, "{found} of {plain} that do not turn are found");
     }
 }
