@@ -145,6 +145,7 @@ const ELSEWHERE: &[(&str, &str)] = &[
     ("W0908", "a search finds it: tests/fits.rs"),
     ("W0909", "a search finds it: tests/fits.rs"),
     ("W0911", "a search finds it: tests/fits.rs"),
+    ("W0912", "a search finds it: tests/fits.rs"),
 ];
 
 #[test]

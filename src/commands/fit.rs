@@ -206,7 +206,7 @@ fn conclude(question: &Asked, runs: &Runs, found: Found, seconds: f64, terminal:
     let (found, profiles) = profiled(args, runs, found, settings);
     let pieces = after::pieces(runs, &found, settings, args.pieces);
     let validated = after::judge(runs, &found, settings);
-    let (answer, steps, note) = found;
+    let (answer, steps, coarse) = found;
     let mut fitted = Fitted::new(name, runs, answer, &steps, args.level, seconds + begin.elapsed().as_secs_f64());
     (fitted.profiles, fitted.pieces) = (profiles, pieces);
     for (one, runs) in validated.into_iter().zip(&runs.judged) {
@@ -215,7 +215,7 @@ fn conclude(question: &Asked, runs: &Runs, found: Found, seconds: f64, terminal:
             Err(why) => fitted.notes.push(format!("{} cannot be judged: {why}", runs.parts[0].asks.label)),
         }
     }
-    fitted.notes.extend(note);
+    fitted.coarse = coarse;
     fitted.rank = rank;
     let mut outcomes = Vec::new();
     for ((part, step), items) in runs.parts.iter().zip(&steps).zip(runs.items()) {
@@ -231,12 +231,12 @@ fn conclude(question: &Asked, runs: &Runs, found: Found, seconds: f64, terminal:
                 return End::Failed;
             }
         }
-        let solver = fitted.solver(part, *step);
+        let on = Fitted::step_on(part, *step);
         fitted.runs.push(answer::Run {
             verdicts: own(part, &outcomes[outcomes.len() - 1]).to_vec(),
-            measures: part.measures(values, solver.step),
+            measures: part.measures(values, on),
             unsettled: if part.asks.steady { part.unsettled(values, &fitted.answer.rms[items]) } else { 0 },
-            solver,
+            solver: part.solver(on),
             step: *step,
             remarks: after::remarks(part, &fitted.answer, runs.items()[fitted.runs.len()].clone()),
         });
@@ -313,11 +313,11 @@ fn profiled(
                 Some(Err(better)) => {
                     if again && let Ok(next) = search_from(runs, &better, settings) {
                         again = false;
-                        let (mut answer, steps, note) = next;
+                        let (mut answer, steps, coarse) = next;
                         answer.runs += found.0.runs;
                         (answer.starts, answer.followed, answer.ends) =
                             (found.0.starts, found.0.followed, found.0.ends.clone());
-                        found = (answer, steps, note);
+                        found = (answer, steps, coarse);
                         continue 'answer;
                     }
                     None

@@ -496,6 +496,7 @@ pub const LINTS: &[(&str, &str)] = &[
     ("start", "W0908"),
     ("lone", "W0909"),
     ("unsettled", "W0911"),
+    ("coarse", "W0912"),
 ];
 
 impl System {

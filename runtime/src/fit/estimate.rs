@@ -16,6 +16,7 @@ use crate::fit::trust_region::{End, Ended, Limits, Objective, minimise};
 use crate::fit::unknowns::{Elementary, Scale, Unknown};
 use crate::rng::Chance;
 use std::collections::BTreeMap;
+use std::ops::Range;
 
 /// Differences between model and measurement: for each item, a number for each row.
 pub type Residuals = Vec<Vec<f64>>;
@@ -23,6 +24,10 @@ pub type Residuals = Vec<Vec<f64>>;
 /// Runs the model in this way with each of these sets of values, in SI, in the order of the unknowns. An error says why
 /// a run failed.
 pub type Runs<'a> = dyn FnMut(Way, &[Vec<f64>]) -> Vec<Result<Residuals, String>> + 'a;
+
+/// Runs the model with these values, in SI, and shorter steps: for one recording after the other, its items, and what
+/// they leave then. An error says why a run failed.
+pub type Finer<'a> = dyn FnMut(&[f64]) -> Vec<(Range<usize>, Result<Residuals, String>)> + 'a;
 
 /// How the model is run.
 #[derive(Clone, Copy, PartialEq, Debug)]
@@ -87,6 +92,8 @@ pub struct Question<'a> {
     pub minima: Minima,
     /// Runs the model.
     pub run: &'a mut Runs<'a>,
+    /// Runs it with shorter steps, where their effect on the values is of interest.
+    pub finer: Option<&'a mut Finer<'a>>,
     /// Elementary functions.
     pub with: Elementary<'a>,
     /// Probability of the intervals.
@@ -164,6 +171,9 @@ pub struct Answer {
     pub agreed: usize,
     /// Where each search ended: −2 log-likelihood with white noise, up to a constant.
     pub ends: Vec<f64>,
+    /// For each recording of [`Question::finer`]: by how much the shorter steps move each value, in its standard
+    /// deviations, or why they cannot be run.
+    pub shifts: Vec<Result<Vec<f64>, String>>,
     /// Number of runs, and how many of them failed for each cause.
     pub runs: u64,
     /// Causes of failed runs, with their numbers.
@@ -209,7 +219,7 @@ const NO_NOISE: f64 = 1e-3;
 ///
 /// # Errors Why there is no answer.
 pub fn fit(question: Question) -> Result<Answer, Trouble> {
-    let Question { unknowns, items, minima, run, with, level, limits, starts, seed, estimator } = question;
+    let Question { unknowns, items, minima, run, finer, with, level, limits, starts, seed, estimator } = question;
     let n = unknowns.len();
     assert!(n > 0 && !items.is_empty(), "{n} unknowns, {} items", items.len());
     let scale = Scale { unknowns, with };
@@ -269,7 +279,7 @@ pub fn fit(question: Question) -> Result<Answer, Trouble> {
         }
     }
     let why = end.why;
-    let mut outcome = Outcome { why, starts, followed, misfits: false };
+    let mut outcome = Outcome { why, starts, followed, misfits: false, finer };
     let even = |item: &Item| matches!(item.rows, Rows::Even(_));
     if estimator == Estimator::LeastSquares || !items.iter().any(even) {
         outcome.misfits = estimator == Estimator::LeastSquares;
@@ -296,12 +306,14 @@ pub fn fit(question: Question) -> Result<Answer, Trouble> {
 }
 
 /// How a search ended, and where those followed did.
-struct Outcome {
+struct Outcome<'a> {
     why: Ended,
     starts: usize,
     followed: (Vec<f64>, usize),
     /// The residuals are no noise.
     misfits: bool,
+    /// Runs the model with shorter steps.
+    finer: Option<&'a mut Finer<'a>>,
 }
 
 /// The paths from the start of this order, each followed to its end. Where a minimum is easily missed, a plain search
@@ -640,7 +652,7 @@ impl Search<'_> {
     }
 
     fn conclude(mut self, items: &[Item], x: &[f64], level: f64, outcome: Outcome) -> Result<Answer, Trouble> {
-        let Outcome { why, starts, followed: (ends, agreed), misfits } = outcome;
+        let Outcome { why, starts, followed: (ends, agreed), misfits, finer: shorter } = outcome;
         let n = x.len();
         let residuals = self.residuals(x).map_err(Trouble::NoStart)?;
         let failed = |this: &Self| Trouble::NoStart(this.commonest());
@@ -705,6 +717,22 @@ impl Search<'_> {
             slopes[i].iter().map(of).sum()
         };
         let sd: Vec<f64> = (0..n).map(|k| covariance(k, k).sqrt()).collect();
+        // Other residuals move the minimum by −(JᵀJ)⁻¹Jᵀ of their change (Gauss and Newton).
+        let moved = |residuals: &Residuals| -> Vec<f64> {
+            let change: Vec<f64> = self.white(x, residuals).iter().zip(&white).map(|(a, b)| a - b).collect();
+            let parts = singular((0..n).map(of_r).collect(), &reduced(&columns, &change).qf);
+            let weights: Vec<f64> =
+                parts.values.iter().zip(&parts.uf).map(|(s, uf)| if *s > 0.0 { uf / s } else { 0.0 }).collect();
+            let along = |k: usize| -> f64 { parts.vectors.iter().zip(&weights).map(|(v, w)| -v[k] * w).sum() };
+            (0..n).map(|k| slopes[k].iter().map(|(a, slope)| slope * along(*a)).sum::<f64>() / sd[k]).collect()
+        };
+        let of_recording = |(items, found): (Range<usize>, Result<Residuals, String>)| {
+            let mut other = residuals.clone();
+            other.splice(items, found?);
+            Ok(moved(&other))
+        };
+        let shifts: Vec<Result<Vec<f64>, String>> =
+            shorter.map_or(Vec::new(), |shorter| shorter(&values).into_iter().map(of_recording).collect());
         let stretch = scattered.as_ref().map_or(1.0, |scattered| scattered.stretch());
         let t = quantiles::student(level, degrees, &self.scale.with) * stretch;
         // In the scale of each unknown on its own.
@@ -751,7 +779,8 @@ impl Search<'_> {
             ends,
             noise,
             weights: self.noise,
-            runs: self.runs,
+            runs: self.runs + shifts.len() as u64,
+            shifts,
             failures: self.failures,
         })
     }
@@ -841,6 +870,7 @@ mod tests {
             items,
             minima: DRIVEN,
             run: &mut run,
+            finer: None,
             with: PLATFORM,
             level: 0.95,
             limits: LIMITS,
@@ -918,6 +948,7 @@ mod tests {
                     items,
                     minima: DRIVEN,
                     run,
+                    finer: None,
                     with: PLATFORM,
                     level: 0.95,
                     limits: LIMITS,
@@ -1049,6 +1080,7 @@ mod tests {
             items: &item,
             minima: DRIVEN,
             run: &mut run,
+            finer: None,
             with,
             level: 0.95,
             limits: LIMITS,
@@ -1064,6 +1096,7 @@ mod tests {
             items: &item,
             minima: DRIVEN,
             run: &mut never,
+            finer: None,
             with,
             level: 0.95,
             limits: LIMITS,
@@ -1093,6 +1126,7 @@ mod tests {
                 items: &[Item { sd: None, rows: Rows::Even(Vec::new()) }],
                 minima: Minima { regimes: true, ..Minima::default() },
                 run: &mut run,
+                finer: None,
                 with: PLATFORM,
                 level: 0.95,
                 limits: LIMITS,
@@ -1136,6 +1170,7 @@ mod tests {
             items: &[Item { sd: None, rows }],
             minima: DRIVEN,
             run: &mut run,
+            finer: None,
             with: PLATFORM,
             level: 0.95,
             limits: LIMITS,
@@ -1204,6 +1239,49 @@ mod tests {
         }
         // Binomial: 190 ± 3 of 200, less what the few windows cost.
         assert!(held.iter().all(|held| (176..=200).contains(held)), "of 200: {held:?}");
+    }
+
+    /// Of a linear model the shift is that of a fit with the other residuals, in standard deviations.
+    #[test]
+    fn shifts_are_those_of_a_fit_with_the_other_residuals() {
+        for seed in 0..50 {
+            let mut chance = Chance(seed);
+            let functions: Vec<Vec<f64>> =
+                (0..3).map(|_| (0..60).map(|_| chance.between(-1.0, 1.0)).collect()).collect();
+            let data = linear(&functions, &[0.0; 60], &[1.0, -2.0, 0.5]);
+            let data: Vec<f64> = data.iter().map(|y| y + 0.1 * normal(&mut chance)).collect();
+            let bias: Vec<f64> = (0..60).map(|row| chance.between(-0.1, 0.2) * f64::from(row % 7)).collect();
+            let left = |p: &[f64]| linear(&functions, &data, p);
+            let other = |p: &[f64]| left(p).iter().zip(&bias).map(|(r, bias)| r + bias).collect::<Vec<f64>>();
+            let mut run = |_: Way, points: &[Vec<f64>]| {
+                points.iter().map(|p| Ok(vec![left(p)])).collect::<Vec<Result<Residuals, String>>>()
+            };
+            let mut finer = |p: &[f64]| vec![(0..1, Ok(vec![other(p)])), (0..1, Err("too long".to_string()))];
+            let answer = fit(Question {
+                unknowns: &[PLAIN; 3],
+                items: &[Item { sd: None, rows: Rows::Independent }],
+                minima: DRIVEN,
+                run: &mut run,
+                finer: Some(&mut finer),
+                with: PLATFORM,
+                level: 0.95,
+                limits: LIMITS,
+                starts: 1,
+                seed,
+                estimator: Estimator::Chosen,
+            });
+            let answer = answer.expect("it has an answer");
+            let moved = asked(&[PLAIN; 3], Rows::Independent, 1, &other);
+            let shift = answer.shifts[0].as_ref().expect("it can be run");
+            for k in 0..3 {
+                let expected = (moved.values[k] - answer.values[k]) / answer.sd[k];
+                assert!(
+                    (shift[k] - expected).abs() < 1e-3 * (1.0 + expected.abs()),
+                    "seed {seed}: {shift:?}, {expected}"
+                );
+            }
+            assert_eq!(answer.shifts[1], Err("too long".into()));
+        }
     }
 
     /// Two unknowns, one of which never lies below the other, with ranges of any kind: from every start the search ends

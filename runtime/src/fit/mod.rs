@@ -16,7 +16,7 @@ pub mod ranking;
 pub mod information;
 pub mod cma_es;
 
-pub use estimate::{Answer, Combination, Estimator, Item, Minima, Question, Residuals, Rows, Trouble, Way, fit};
+pub use estimate::{Answer, Combination, Estimator, Finer, Item, Minima, Question, Residuals, Rows, Trouble, Way, fit};
 pub use noise::Noise;
 pub use trust_region::{Ended, Limits};
 pub use unknowns::{Elementary, Unknown};

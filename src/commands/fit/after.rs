@@ -71,7 +71,7 @@ fn restricted(
         });
         run(&expanded.collect::<Vec<_>>())
     };
-    estimate(runs, &unknowns, items, Settings { starts: Some(1), ..settings }, &mut whole)
+    estimate(runs, &unknowns, items, Settings { starts: Some(1), ..settings }, (&mut whole, None))
 }
 
 /// Whether an unknown is part of a combination that the data do not determine.
@@ -314,8 +314,7 @@ pub fn judge(runs: &Runs, (answer, steps, _): &Found, settings: Settings) -> Vec
         let part = &judged.parts[0];
         // The steps are those of a fitted run of the same case.
         let same = runs.parts.iter().position(|other| other.asks.place.case == part.asks.place.case);
-        let ratio =
-            same.map_or(1.0, |k| if runs.parts[k].step() > 0.0 { steps[k] / runs.parts[k].step() } else { 1.0 });
+        let ratio = same.map_or(1.0, |k| steps[k] / runs.parts[k].step());
         let steps = vec![part.step() * ratio];
         let value = |unknown: &crate::compile::FitUnknown| {
             let shared = |(other, _): &(&crate::compile::FitUnknown, &f64)| other.span == unknown.span;

@@ -1,7 +1,7 @@
 //! The answer of a fit in words, as JSON and as a table.
 
 use super::after::{Judged, NAMED, Piece, Profile, Remarks, scatter};
-use super::search::{Part, Runs};
+use super::search::{Coarse, Part, Runs};
 use crate::compile::{Asks, ElementaryFunction, FitItem, FitUnknown, HELD};
 use crate::quantity::{count, duration, show, significant};
 use crate::results::{self, number};
@@ -45,13 +45,15 @@ pub struct Fitted {
     seconds: f64,
     /// Rank among several laws, and the rms of rows that the law has not seen, in SI.
     pub rank: Option<(usize, f64)>,
+    /// Steps that are too long.
+    pub coarse: Option<Coarse>,
     /// Notes for the user.
     pub notes: Vec<String>,
 }
 
 /// A run against one recording, with the values found.
 pub struct Run {
-    /// Step of the search in s.
+    /// Step of the search in s, or its tolerance.
     pub step: f64,
     /// The solver of the text to go on with: with a quarter of the step, so that its numerical error is small against
     /// its noise, unless the step is given.
@@ -104,6 +106,7 @@ impl Fitted {
             level,
             seconds,
             rank: None,
+            coarse: None,
             notes,
         }
     }
@@ -112,15 +115,16 @@ impl Fitted {
         &self.name
     }
 
-    /// The solver of the text to go on with, of a run whose search had steps of this length.
-    pub fn solver(&self, part: &Part, step: f64) -> Solver {
-        let given = part.asks.solver_given || part.varying.keeps_past();
-        Solver { step: if given { step } else { FINER * step }, ..part.varying.experiment.solver }
+    /// The step of the text to go on with, of a run whose search had steps of this length.
+    pub fn step_on(part: &Part, step: f64) -> f64 {
+        let given = part.asks.solver_given || part.is_adaptive() || part.varying.keeps_past();
+        if given { step } else { FINER * step }
     }
 
     /// The solver of the search, where all runs have the same.
-    fn solver_of_all(&self) -> Option<String> {
-        let mut all = self.runs.iter().map(|run| results::solver(&Solver { step: run.step, ..run.solver }));
+    fn solver_of_all(&self, runs: &Runs) -> Option<String> {
+        let each = runs.parts.iter().zip(&self.runs);
+        let mut all = each.map(|(part, run)| results::solver(&part.solver(run.step)));
         let first = all.next()?;
         all.all(|other| other == first).then_some(first)
     }
@@ -190,6 +194,26 @@ impl Fitted {
             all.push(("rough", warning.help(
                 "its standard deviation may be wrong: take a tighter tolerance or a shorter step, or locate events with `solver adaptive`",
             )));
+        }
+        if let Some(Coarse { part, by }) = &self.coarse {
+            let of = if runs.parts.len() > 1 { format!(" of {}", runs.parts[*part].asks.label) } else { String::new() };
+            let solver = results::solver(&runs.parts[*part].solver(self.runs[*part].step));
+            let (message, span, label) = match by {
+                Ok((k, by)) => {
+                    let unknown = &runs.unknowns[*k];
+                    let by = format!("{} of its standard deviation", significant(*by, 2));
+                    (
+                        format!("the steps{of} are too long for the interval of `{}`", unknown.label),
+                        unknown.span,
+                        format!("shorter ones move it by {by}"),
+                    )
+                }
+                Err(why) => {
+                    (format!("the steps{of} may be too long"), runs.name, format!("shorter ones cannot be run: {why}"))
+                }
+            };
+            let warning = Diagnostic::warning("W0912", message).label(span, label);
+            all.push(("coarse", warning.help(format!("they are those of `{solver}`: give shorter ones, by `--step` or `--tol`, or in the text by `solver`"))));
         }
         for (k, unknown) in runs.unknowns.iter().enumerate() {
             let Some(found) = scatter(&self.pieces, k).filter(|found| found.drifts) else { continue };
@@ -297,7 +321,7 @@ impl Fitted {
             heading.insert(0, format!("{} recordings", runs.parts.len()));
         }
         heading.push(format!("{n} {}", if n == 1 { "unknown" } else { "unknowns" }));
-        heading.extend(self.solver_of_all());
+        heading.extend(self.solver_of_all(runs));
         let law = if runs.label.is_empty() { String::new() } else { format!(", {}", runs.label) };
         let mut out = format!("  {}{law}: {}\n", models(runs), heading.join(", "));
         let starts = match answer.starts {
@@ -362,9 +386,9 @@ impl Fitted {
         for ((part, run), items) in runs.parts.iter().zip(&self.runs).zip(runs.items()) {
             let indent = if several { "    " } else { "  " };
             if several {
-                let solver = match self.solver_of_all() {
+                let solver = match self.solver_of_all(runs) {
                     Some(_) => String::new(),
-                    None => format!(", {}", results::solver(&Solver { step: run.step, ..run.solver })),
+                    None => format!(", {}", results::solver(&part.solver(run.step))),
                 };
                 let rows = count(part.asks.rows.len() as u64);
                 let what = if part.asks.steady { "steady points" } else { "rows" };
@@ -470,6 +494,7 @@ impl Fitted {
                     "range": [of(one.range.0), of(one.range.1)],
                     "at_bound": answer.at_bound[k].map(|upper| if upper { "upper" } else { "lower" }),
                     "rough": answer.rough.contains(&k),
+                    "step_shift": (!answer.shifts.is_empty()).then(|| number(answer.shifts.iter().flatten().map(|shift| shift[k]).sum())),
                     "pieces": self.pieces.iter().map(|piece| piece[k].map(|(value, sd)| json!({
                         "value": of(value),
                         "sd": width(&one.unit, sd),
@@ -504,7 +529,7 @@ impl Fitted {
                     "rows": part.asks.rows.len(),
                     "steady": part.asks.steady,
                     "begins": number(part.asks.begins),
-                    "solver": results::solver(&Solver { step: run.step, ..run.solver }),
+                    "solver": results::solver(&part.solver(run.step)),
                     "compared": part.asks.items.iter().zip(items).map(compared).collect::<Vec<_>>(),
                     "expects": run.verdicts.iter().map(results::verdict_json).collect::<Vec<_>>(),
                 })

@@ -5,21 +5,24 @@
 
 use crate::args::{self, STARTS, STARTS_WITH_REGIMES};
 use crate::compile::{self, ElementaryFunction, HELD, Varying};
-use crate::quantity::{duration, significant};
-use abi::plan::{Experiment, Method};
+use abi::plan::{Experiment, Method, Solver};
 use abi::{Instance, Slot};
 use grammar::span::Span;
 use runtime::engine::{self, Cause, Continue, Failure, lanes};
 use runtime::fit::statistics::intervals;
-use runtime::fit::{Answer, Elementary, Estimator, Item, Limits, Minima, Question, Rows, Trouble, Unknown, Way};
+use runtime::fit::{Answer, Elementary, Estimator, Finer, Item, Limits, Minima, Question, Rows, Trouble, Unknown, Way};
 use std::ops::Range;
 
 /// When a search ends.
 const LIMITS: Limits = Limits { trials: 100, tolerance: 1e-8 };
-/// A step is short enough if half of it changes no residual by more than this part of the noise.
-const PART_OF_NOISE: f64 = 0.1;
-/// How often a step is halved at most.
+/// A step is short enough if a quarter of it moves no value by more than this part of its standard deviation. At the kinks
+/// of a law the error may be in proportion to the step; then all shorter ones move a value by a third more, 0.1.
+const PART_OF_DEVIATION: f64 = 0.075;
+/// How often a step is halved at most, and a tolerance divided by ten.
 const MOST_HALVINGS: u32 = 8;
+const MOST_DECADES: u32 = 3;
+/// A steady point has settled if a compared quantity moves by less than this part of its residuals.
+const PART_OF_RESIDUALS: f64 = 0.1;
 /// Relative tolerance of runs that an observer holds to their recording. They follow its noise, so a smaller one gains nothing.
 const HELD_TOL: f64 = 1e-5;
 
@@ -89,15 +92,46 @@ impl Part {
         Part { threads, varying, asks, instants, slots, held }
     }
 
-    /// The step as the text has it, in s; 0 for an adaptive run.
-    pub fn step(&self) -> f64 {
-        self.varying.experiment.solver.step
+    /// Whether its steps follow from a tolerance.
+    pub fn is_adaptive(&self) -> bool {
+        self.varying.experiment.solver.method == Method::Adaptive
     }
 
-    /// Whether the step is not the search's to choose.
-    fn is_fixed(&self) -> bool {
-        let adaptive = self.varying.experiment.solver.method == Method::Adaptive;
-        self.asks.solver_given || adaptive || self.varying.keeps_past()
+    /// The step as the text has it, in s; of an adaptive run its tolerance.
+    pub fn step(&self) -> f64 {
+        let solver = &self.varying.experiment.solver;
+        if self.is_adaptive() { solver.tol } else { solver.step }
+    }
+
+    /// The solver with steps of this length; an adaptive one with this tolerance.
+    pub fn solver(&self, step: f64) -> Solver {
+        let solver = self.varying.experiment.solver;
+        if self.is_adaptive() { Solver { tol: step, ..solver } } else { Solver { step, ..solver } }
+    }
+
+    /// A shorter step, with which a run is compared. Where the instants of kinks lie in a step is chance, and half a step
+    /// may have the same error.
+    fn finer(&self, step: f64) -> f64 {
+        if self.is_adaptive() { 0.1 * step } else { 0.25 * step }
+    }
+
+    /// The next shorter step, as a factor, and that of its error: fixed steps have methods of order 2.
+    fn shorter(&self) -> (f64, f64) {
+        if self.is_adaptive() { (0.1, 0.1) } else { (0.5, 0.25) }
+    }
+
+    /// How often a step may be shortened: not at all where the text gives it.
+    fn most_shortenings(&self) -> u32 {
+        match (self.asks.solver_given, self.is_adaptive()) {
+            (true, _) => 0,
+            (false, true) => MOST_DECADES,
+            (false, false) => MOST_HALVINGS,
+        }
+    }
+
+    /// Whether the error of the steps can be known: a memory has a length that fits one step alone.
+    fn is_checked(&self) -> bool {
+        self.is_adaptive() || !self.varying.keeps_past()
     }
 
     /// The values on which a run against this recording depends.
@@ -132,16 +166,15 @@ impl Part {
         };
         let mut experiment = made.experiment;
         match experiment.solver.method {
-            Method::Adaptive if matches!(way, Way::Held(_)) => {
-                experiment.solver.tol = experiment.solver.tol.max(HELD_TOL)
-            }
+            Method::Adaptive if matches!(way, Way::Held(_)) => experiment.solver.tol = step.max(HELD_TOL),
             Method::Adaptive if self.asks.driven => {
+                experiment.solver.tol = step;
                 let end = experiment.duration;
                 experiment.corners.extend(self.asks.corners.iter().filter(|t| **t > 0.0 && **t < end));
                 experiment.corners.sort_by(f64::total_cmp);
                 experiment.corners.dedup();
             }
-            Method::Adaptive => {}
+            Method::Adaptive => experiment.solver.tol = step,
             _ => experiment.solver.step = step,
         }
         if let Some(last) = instants.last().filter(|last| **last < experiment.duration) {
@@ -262,7 +295,7 @@ impl Part {
         let pairs: Vec<f64> = self.instants.iter().flat_map(|t| [t - 0.5 * HELD, *t]).collect();
         let Ok(values) = self.sampled(&[values.to_vec()], self.step(), &pairs, &self.slots).remove(0) else { return 0 };
         let width = self.slots.len();
-        let moves = |pair: &&[f64]| (0..width).any(|k| (pair[k] - pair[width + k]).abs() > PART_OF_NOISE * rms[k]);
+        let moves = |pair: &&[f64]| (0..width).any(|k| (pair[k] - pair[width + k]).abs() > PART_OF_RESIDUALS * rms[k]);
         values.chunks(2 * width).filter(moves).count()
     }
 }
@@ -277,7 +310,7 @@ impl Runs {
         Runs { label, judged, parts, unknowns, name, allowed }
     }
 
-    /// The steps as the text has them.
+    /// The steps as the text has them; of adaptive runs their tolerances.
     pub fn steps(&self) -> Vec<f64> {
         self.parts.iter().map(Part::step).collect()
     }
@@ -454,8 +487,17 @@ impl Settings {
     }
 }
 
-/// An answer, the steps of its runs, and what is to be said of it.
-pub type Found = (Answer, Vec<f64>, Option<String>);
+/// An answer, the steps of its runs, and steps that are too long.
+pub type Found = (Answer, Vec<f64>, Option<Coarse>);
+
+/// Steps of a run that are too long for the intervals of the values.
+#[derive(Clone, Debug)]
+pub struct Coarse {
+    /// Which run has them.
+    pub part: usize,
+    /// The value that shorter ones move most, in its standard deviations; or why these cannot be run.
+    pub by: Result<(usize, f64), String>,
+}
 
 /// Runs a model in some way with sets of values.
 pub(super) type Model<'a> = dyn FnMut(Way, &[Vec<f64>]) -> Vec<Residuals> + 'a;
@@ -466,7 +508,7 @@ pub(super) fn estimate(
     unknowns: &[Unknown],
     items: &[Item],
     settings: Settings,
-    run: &mut Model,
+    (run, finer): (&mut Model, Option<&mut Finer>),
 ) -> Result<Answer, Trouble> {
     let (exp, log) = (ElementaryFunction::exp(), ElementaryFunction::log());
     runtime::fit::fit(Question {
@@ -474,6 +516,7 @@ pub(super) fn estimate(
         items,
         minima: runs.minima(),
         run,
+        finer: finer.map(|finer| finer as &mut Finer),
         with: Elementary { exp: &|x| exp.at(x), log: &|x| log.at(x) },
         level: settings.level,
         limits: settings.limits,
@@ -483,7 +526,7 @@ pub(super) fn estimate(
     })
 }
 
-/// Searches with the steps of the text, and again with half of those of which half moves a residual noticeably.
+/// Searches with the steps of the text, and again with shorter ones while these move a value noticeably.
 pub fn search(runs: &Runs, settings: Settings) -> Result<Found, Trouble> {
     let written: Vec<f64> = runs.unknowns.iter().map(|one| one.start).collect();
     searched(runs, &written, settings)
@@ -497,53 +540,61 @@ pub fn search_from(runs: &Runs, values: &[f64], settings: Settings) -> Result<Fo
 fn searched(runs: &Runs, written: &[f64], settings: Settings) -> Result<Found, Trouble> {
     let (mut unknowns, items) = (runs.asked(written), runs.compared_whole());
     let mut steps = runs.steps();
+    let checked: Vec<usize> = (0..runs.parts.len()).filter(|k| runs.parts[*k].is_checked()).collect();
+    let mut left: Vec<u32> = runs.parts.iter().map(Part::most_shortenings).collect();
     let mut spent = 0;
     let mut judged = None;
-    for halvings in 0.. {
+    loop {
         let mut run = |way: Way, points: &[Vec<f64>]| runs.residuals(way, points, &steps);
+        let mut finer = |values: &[f64]| {
+            let one = |k: &usize| {
+                let part = &runs.parts[*k];
+                let step = part.finer(steps[*k]);
+                let found = part.residuals_at(Way::Whole, &[values.to_vec()], step, &part.instants).remove(0);
+                (runs.items()[*k].clone(), found)
+            };
+            checked.iter().map(one).collect::<Vec<_>>()
+        };
         let starts = if judged.is_none() { settings.starts } else { Some(1) };
-        let mut answer = estimate(runs, &unknowns, &items, Settings { starts, ..settings }, &mut run)?;
+        let settings = Settings { starts, ..settings };
+        let mut answer = estimate(runs, &unknowns, &items, settings, (&mut run, Some(&mut finer)))?;
         // Later searches continue from where the first one ended.
         let first = judged.get_or_insert((answer.starts, answer.followed, answer.agreed, answer.ends.clone()));
         (answer.starts, answer.followed, answer.agreed, answer.ends) = first.clone();
         answer.runs += spent;
-        let mut too_long: Vec<(usize, Result<f64, String>)> = Vec::new();
-        for (k, (part, items)) in runs.parts.iter().zip(runs.items()).enumerate() {
-            if part.is_fixed() {
-                continue;
-            }
-            let point = std::slice::from_ref(&answer.values);
-            let finer = part.residuals_at(Way::Whole, point, 0.5 * steps[k], &part.instants).remove(0);
-            let moved = finer.map(|finer| {
-                let one = |(finer, item): (&Vec<f64>, usize)| {
-                    let noise = answer.noise[item].variance.sqrt();
-                    let pairs = finer.iter().zip(&answer.residuals[item]);
-                    pairs.map(|(a, b)| (a - b).abs() / noise).fold(0.0, f64::max)
-                };
-                finer.iter().zip(items).map(one).fold(0.0, f64::max)
-            });
-            spent = answer.runs + 1;
-            if !moved.as_ref().is_ok_and(|moved| *moved <= PART_OF_NOISE) {
-                too_long.push((k, moved));
+        spent = answer.runs;
+        let Some(coarse) = coarse(&checked, &answer.shifts) else { return Ok((answer, steps, None)) };
+        // Each recording has its share of what is allowed.
+        let share = PART_OF_DEVIATION / checked.len() as f64;
+        let mut is_shorter = false;
+        for (k, shift) in checked.iter().zip(&answer.shifts) {
+            let Ok(shift) = shift else { continue };
+            let mut moved = shift.iter().map(|part| part.abs()).fold(0.0, f64::max);
+            let (shorter, less) = runs.parts[*k].shorter();
+            while moved > share && left[*k] > 0 {
+                (moved, steps[*k]) = (less * moved, shorter * steps[*k]);
+                (left[*k], is_shorter) = (left[*k] - 1, true);
             }
         }
-        let failed = too_long.iter().find(|(_, moved)| moved.is_err());
-        let Some((k, moved)) = failed.or(too_long.first()) else { return Ok((answer, steps, None)) };
-        if failed.is_none() && halvings < MOST_HALVINGS {
-            for (k, _) in &too_long {
-                steps[*k] *= 0.5;
-            }
-            for (unknown, value) in unknowns.iter_mut().zip(&answer.values) {
-                unknown.start = *value;
-            }
-            continue;
+        if !is_shorter || coarse.by.is_err() {
+            return Ok((answer, steps, Some(coarse)));
         }
-        let by = match moved {
-            Err(why) => why.clone(),
-            Ok(moved) => format!("half of it moves a residual by {} of the noise", significant(*moved, 2)),
-        };
-        let note = format!("steps of {} may be too long: {by}", duration(steps[*k], 3));
-        return Ok((answer, steps, Some(note)));
+        for (unknown, value) in unknowns.iter_mut().zip(&answer.values) {
+            unknown.start = *value;
+        }
     }
-    unreachable!("the loop returns")
+}
+
+/// Whether shorter steps of all recordings together move a value noticeably, or cannot be run. `parts`: the recordings.
+fn coarse(parts: &[usize], shifts: &[Result<Vec<f64>, String>]) -> Option<Coarse> {
+    let failed = parts.iter().zip(shifts).find_map(|(part, shift)| Some((*part, shift.as_ref().err()?)));
+    if let Some((part, why)) = failed {
+        return Some(Coarse { part, by: Err(why.clone()) });
+    }
+    let known: Vec<&Vec<f64>> = shifts.iter().flatten().collect();
+    let sum = |k: usize| known.iter().map(|shift| shift[k]).sum::<f64>().abs();
+    let unknowns = known.first().map_or(0, |shift| shift.len());
+    let worst = (0..unknowns).filter(|k| sum(*k) > PART_OF_DEVIATION).max_by(|a, b| sum(*a).total_cmp(&sum(*b)))?;
+    let largest = (0..known.len()).max_by(|a, b| known[*a][worst].abs().total_cmp(&known[*b][worst].abs()))?;
+    Some(Coarse { part: parts[largest], by: Ok((worst, sum(worst))) })
 }
