@@ -148,6 +148,13 @@ fn what_cannot_be_excited_is_refused() {
     assert!(refused("unit", SLIDE, &["--limit", "v = -1 mm .. 1 mm"], 1).contains("`v` is a velocity, not mm"));
     assert!(refused("name", SLIDE, &["--limit", "F = -1 N .. 1 N"], 1).contains("limits are of x, v, a"));
     assert!(refused("around", SLIDE, &["--limit", "v = 1 mm/s .. 2 mm/s"], 2).contains("must lie around 0"));
+    let case = SLIDE.replace("  run Slide(v = data.v)\n  data", "  case slow {\n  run Slide(v = data.v)\n  data");
+    let cases = case.replace("  vary k, c, F0\n", "").replace(" / 20 mN\n}", " / 20 mN\n  }\n  vary k, c, F0\n}");
+    assert!(refused("cases", &cases, &limit, 1).contains("fit `slide` has cases; write a fit for each"));
+    let slot = "import std.interfaces\nimport std.friction\nmodel Bench {\n  input v [m/s]\n  part fr : Friction = CoulombViscous(v = v)\n  output F [N] = fr.F\n}\nfit law {\n  run Bench(v = data.v)\n  sweep fr = Coulomb(), CoulombViscous()\n  data \"r.csv\" (t [s], v [m/s], F [N])\n  vary fr.Fc in 0.1 N .. 10 N\n  minimise rms(F - data.F) / 20 mN\n}\n";
+    assert!(
+        refused("sweep", slot, &limit, 1).contains("fit `law` has several laws; write a fit for the one to be excited")
+    );
     assert!(refused("words", SLIDE, &["--limit", "v < 1 mm/s"], 2).contains("write it as"));
 }
 

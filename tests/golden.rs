@@ -52,7 +52,7 @@ fn messages_are_golden_to_the_letter() {
 
 #[test]
 fn messages_of_fits_are_golden_to_the_letter() {
-    check("tests/errors/fit", 10, said_by_fit);
+    check("tests/errors/fit", 19, said_by_fit);
 }
 
 /// A text with a habit of another tool, and what is said about it.
