@@ -584,6 +584,9 @@ pub struct Fit {
     /// Threads; the answer does not depend on their number [default: one for each processor]
     #[arg(long, value_name = "N", value_parser = threads)]
     pub threads: Option<usize>,
+    /// Go on with a fit that was interrupted, from its last stage: the answer has the same bytes
+    #[arg(long)]
+    pub resume: bool,
     /// Write NAME.html too: figures of residuals and profiles, with every number
     #[arg(long)]
     pub report: bool,

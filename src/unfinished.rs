@@ -72,7 +72,7 @@ impl Unfinished {
         let about = |error: io::Error| format!("cannot write {}: {error}", path.display());
         let Some(file) = open_alone(&path).map_err(about)? else {
             return Err(format!(
-                "another sweep writes {}: wait until it has ended, or give this one another --out",
+                "another process writes {}: wait until it has ended, or give this one another --out",
                 table.display()
             ));
         };
@@ -223,7 +223,7 @@ mod tests {
         let first = Unfinished::claim(&table).unwrap();
         assert_eq!(first.before(), None);
         let why = Unfinished::claim(&table).err().unwrap();
-        assert!(why.starts_with("another sweep writes ") && why.contains("a.csv: wait"), "{why}");
+        assert!(why.starts_with("another process writes ") && why.contains("a.csv: wait"), "{why}");
         drop(first);
         assert!(!marker.exists(), "it had not begun");
         interrupted(&table);

@@ -1093,3 +1093,66 @@ fn a_shorter_step_moves_no_value_noticeably() {
     assert!(named >= 6, "a step of the rows is too long in {named} of 12");
     assert!(met >= 9, "a short step was found in {met} of 12");
 }
+
+/// A fit that is killed while its stages end, and goes on with `--resume`, writes the same bytes as one that is not
+/// interrupted, with any number of threads. Another question is refused, and a damaged stage is computed again.
+#[test]
+fn a_fit_that_was_killed_goes_on_to_the_same_bytes() {
+    let text = format!(
+        "{OFFSET}fit f {{\n  run Slide(v = data.v)\n  data \"r0.csv\", \"r1.csv\", \"r2.csv\" (t [s], v [m/s], F [N])\n  vary k, c, o each\n  minimise rms(F - data.F)\n}}\n"
+    );
+    let question = |name: &str| {
+        let folder = folder(name);
+        fs::write(folder.join("f.fric"), &text).unwrap();
+        for (file, content) in slides(&mut Chance(3)).0 {
+            fs::write(folder.join(file), content).unwrap();
+        }
+        folder
+    };
+    let options = ["fit", "f.fric", "--profile", "all", "--starts", "200"];
+    let written = |folder: &Path| {
+        let files = ["out/f.json", "out/f.fric", "out/f_r0.csv", "out/f_r2.csv"];
+        files.map(|file| fs::read(folder.join(file)).unwrap_or_else(|error| panic!("{file}: {error}")))
+    };
+    let whole = question("whole");
+    assert!(fric(&whole, &options).status.success());
+    let expected = written(&whole);
+    let left: Vec<_> = fs::read_dir(whole.join("out")).unwrap().map(|file| file.unwrap().file_name()).collect();
+    assert!(left.iter().all(|name| !name.to_string_lossy().contains("stages")), "{left:?}");
+    let stages = |folder: &Path| fs::read(folder.join("out/f.stages")).unwrap_or_default();
+    let lines = |folder: &Path| stages(folder).iter().filter(|byte| **byte == b'\n').count();
+    let mut killed = 0;
+    for turn in 0..10_usize {
+        let folder = question(&format!("killed-{turn}"));
+        let mut child = Command::new(env!("CARGO_BIN_EXE_fric"));
+        let child = child.current_dir(&folder).args(options).stdout(std::process::Stdio::null());
+        let mut child = child.spawn().unwrap();
+        while lines(&folder) < 1 + 3 * turn && child.try_wait().unwrap().is_none() {
+            std::thread::yield_now();
+        }
+        child.kill().unwrap();
+        child.wait().unwrap();
+        let kept = lines(&folder);
+        killed += usize::from(kept > 0);
+        if turn == 4 {
+            let other = fric(&folder, &[&options[..], &["--resume", "--seed", "7"]].concat());
+            let said = String::from_utf8_lossy(&other.stderr);
+            assert!(other.status.code() == Some(1) && said.contains("was begun with another question"), "{said}");
+            assert!(said.contains("--seed 0") && said.contains("--seed 7"), "{said}");
+        }
+        if turn == 5 {
+            let mut damaged = stages(&folder);
+            let at = damaged.len() / 2;
+            damaged[at] ^= 1;
+            fs::write(folder.join("out/f.stages"), damaged).unwrap();
+        }
+        let threads = ["1", "2", "5"][turn % 3];
+        let resumed = fric(&folder, &[&options[..], &["--resume", "--threads", threads]].concat());
+        assert!(resumed.status.success(), "turn {turn}: {resumed:?}");
+        let said = String::from_utf8_lossy(&resumed.stderr);
+        assert_eq!(said.contains("is not as it was written"), turn == 5 && kept > 0, "turn {turn}: {said}");
+        assert!(written(&folder) == expected, "turn {turn}, after {kept} lines");
+        assert!(lines(&folder) == 0 && !folder.join("out/.f.stages.unfinished").exists(), "turn {turn}");
+    }
+    assert!(killed >= 8, "{killed} of 10 were killed before they ended");
+}

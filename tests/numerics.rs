@@ -391,7 +391,7 @@ fn a_table_has_one_writer_and_is_resumed_after_intact_rows_only() {
     }
     for more in [&[][..], &["--resume"]] {
         let (_, err) = folder.run(&[&long("100000", "live.csv")[..], more].concat(), 1);
-        assert!(err.contains("another sweep writes live.csv: wait until it has ended"), "{err}");
+        assert!(err.contains("another process writes live.csv: wait until it has ended"), "{err}");
     }
     // After a kill the table is unlocked; its rows are those of the shorter sweep, and it is turned into an interrupted
     // one.

@@ -3,6 +3,7 @@
 //! The result of the search is shown as a table, as an
 //! instance to paste, and written as JSON, CSV and a picture.
 
+mod kept;
 pub mod search;
 mod after;
 mod answer;
@@ -15,6 +16,7 @@ mod of_laws;
 use super::{End, load, reported, sound, sweep};
 use crate::args;
 use crate::commands::fit::answer::Fitted;
+use crate::commands::fit::kept::{Keeping, Kept};
 use crate::commands::fit::search::{Found, Part, Runs, Settings, search, search_from};
 use crate::compile::{self, Asks, Changes, Loaded, Options, Stopwatch};
 use crate::figure::{self, Recorded};
@@ -71,13 +73,15 @@ pub fn fit(args: &args::Fit, terminal: &mut Terminal) -> End {
     let changes = Changes { data, tol: args.tol, ..args.stepped.changes() };
     let options = Options { changes, interpret: args.interpret };
     let mut end = End::Fine;
+    let mut keeping = Keeping::new(args);
     for name in &names {
-        match one(args, &mut loaded, name, &options, terminal) {
+        match one(args, &mut loaded, name, &options, &mut keeping, terminal) {
             End::Fine => {}
             End::Misused => return End::Misused,
             End::Failed | End::Stopped => end = End::Failed,
         }
     }
+    keeping.finish(terminal);
     end
 }
 
@@ -110,7 +114,14 @@ pub fn only(file: &Path, named: Option<&str>, loaded: &Loaded) -> Result<String,
     }
 }
 
-fn one(args: &args::Fit, loaded: &mut Loaded, name: &str, options: &Options, terminal: &mut Terminal) -> End {
+fn one(
+    args: &args::Fit,
+    loaded: &mut Loaded,
+    name: &str,
+    options: &Options,
+    keeping: &mut Keeping,
+    terminal: &mut Terminal,
+) -> End {
     let mut found = Vec::new();
     let compiled = match compile::fit(loaded, &crate::disk::Disk, name, options, &mut found) {
         Ok(compiled) => compiled,
@@ -127,12 +138,20 @@ fn one(args: &args::Fit, loaded: &mut Loaded, name: &str, options: &Options, ter
         terminal.error(&why);
         return End::Misused;
     }
+    let kept = match keeping.begin(loaded, name, &compiled, terminal) {
+        Ok(kept) => kept,
+        Err(why) => {
+            terminal.error(&why);
+            return End::Failed;
+        }
+    };
     if compiled.len() > 1 {
-        return alternatives(args, compiled, (loaded, name), options, terminal);
+        return alternatives(args, compiled, (loaded, name), (options, kept), terminal);
     }
     let begin = Instant::now();
     let compiled = compiled.into_iter().next().expect("it has been compiled");
-    let runs = Runs::new(compiled, args.threads);
+    let mut runs = Runs::new(compiled, args.threads);
+    runs.keep(kept);
     if args.check {
         return check(args, &runs, loaded, name, terminal);
     }
@@ -157,13 +176,14 @@ fn alternatives(
     args: &args::Fit,
     all: Vec<compile::Fit>,
     (loaded, name): (&Loaded, &str),
-    options: &Options,
+    (options, kept): (&Options, Option<Kept>),
     terminal: &mut Terminal,
 ) -> End {
     let mut tried = Vec::new();
     for fit in all {
         let begin = Instant::now();
-        let runs = Runs::new(fit, args.threads);
+        let mut runs = Runs::new(fit, args.threads);
+        runs.keep(kept.clone());
         if args.check {
             if !args.quiet {
                 terminal.line(&terminal.styled(Style::Bold, &runs.label));

@@ -8,11 +8,12 @@
 //! residuals are no noise, and the estimate remains that of least squares. Derivatives are central differences, of a size that the noise
 //! determines.
 
+use crate::fit::journal::{Journal, Numbers, Stage, of_list, of_noise};
 use crate::fit::least_squares::{Triangle, singular};
 use crate::fit::noise::Noise;
 use crate::fit::quantiles;
 use crate::fit::sandwich::{Stretch, scatter};
-use crate::fit::trust_region::{End, Ended, Limits, Objective, minimise};
+use crate::fit::trust_region::{Ended, Limits, Objective, minimise};
 use crate::fit::unknowns::{Elementary, Scale, Unknown};
 use crate::rng::Chance;
 use std::collections::BTreeMap;
@@ -106,6 +107,8 @@ pub struct Question<'a> {
     pub seed: u64,
     /// How the values are estimated.
     pub estimator: Estimator,
+    /// Keeps the stages of the search, and gives those of an earlier one.
+    pub journal: Option<&'a mut (dyn Journal + 'a)>,
 }
 
 /// Why a fit gives no answer.
@@ -219,7 +222,8 @@ const NO_NOISE: f64 = 1e-3;
 ///
 /// # Errors Why there is no answer.
 pub fn fit(question: Question) -> Result<Answer, Trouble> {
-    let Question { unknowns, items, minima, run, finer, with, level, limits, starts, seed, estimator } = question;
+    let Question { unknowns, items, minima, run, finer, with, level, limits, starts, seed, estimator, journal } =
+        question;
     let n = unknowns.len();
     assert!(n > 0 && !items.is_empty(), "{n} unknowns, {} items", items.len());
     let scale = Scale { unknowns, with };
@@ -237,6 +241,7 @@ pub fn fit(question: Question) -> Result<Answer, Trouble> {
         influence: vec![false; n],
         runs: 0,
         failures: BTreeMap::new(),
+        journal,
     };
     let written = scale.coordinates(&unknowns.iter().map(|unknown| unknown.start).collect::<Vec<f64>>());
     let (judged, rows) = search.judge(items, &spread(&written, &low, &high, starts, seed)).map_err(Trouble::NoStart)?;
@@ -247,11 +252,12 @@ pub fn fit(question: Question) -> Result<Answer, Trouble> {
     let most = if minima.regimes { MOST_FOLLOWED_WITH_REGIMES } else { MOST_FOLLOWED };
     for (order, start) in judged.into_iter().take(most).enumerate() {
         for path in paths(minima, order) {
-            let Some(begin) = search.along(items, &start, path) else { continue };
-            match search.follow(items, begin, limits)? {
-                Some(followed) => ends.push(followed),
-                None => continue,
-            }
+            let stage = search.staged(|search| {
+                let Some(begin) = search.along(items, &start, path) else { return Ok(Vec::new()) };
+                let followed = search.follow(items, begin, limits)?;
+                Ok(followed.map_or(Vec::new(), |followed| followed.numbers()))
+            })?;
+            ends.extend(Followed::read(&stage));
         }
         if agreed(&ends) >= 2 && ends.len() >= LEAST_FOLLOWED {
             break;
@@ -266,8 +272,7 @@ pub fn fit(question: Question) -> Result<Answer, Trouble> {
     // Of equal ends the first one: in a flat valley, that of the written start.
     let least = ends.iter().map(|end| end.misfit).fold(f64::INFINITY, f64::min);
     let best = ends.into_iter().find(|end| end.misfit - least <= EQUAL_END);
-    let Some(Followed { end, noise, .. }) = best else { return Err(Trouble::NoStart(search.commonest())) };
-    let mut x = end.x.clone();
+    let Some(Followed { mut x, why, noise, .. }) = best else { return Err(Trouble::NoStart(search.commonest())) };
     search.noise = noise;
     // A model error that a bound causes looks like correlated noise, in which the parameter would leave the bound.
     let (mut from, mut to) = (low.clone(), high.clone());
@@ -278,7 +283,6 @@ pub fn fit(question: Question) -> Result<Answer, Trouble> {
             None => {}
         }
     }
-    let why = end.why;
     let mut outcome = Outcome { why, starts, followed, misfits: false, finer };
     let even = |item: &Item| matches!(item.rows, Rows::Even(_));
     if estimator == Estimator::LeastSquares || !items.iter().any(even) {
@@ -288,9 +292,14 @@ pub fn fit(question: Question) -> Result<Answer, Trouble> {
     let plain = (x.clone(), search.noise.clone());
     // Twice: a noise model of the residuals, and on from there.
     for _ in 0..2 {
-        let residuals = search.residuals(&x).map_err(Trouble::NoStart)?;
-        search.weigh(items, &residuals, true);
-        let found = minimise(&x, &from, &to, &mut search, limits);
+        let stage = search.staged(|search| {
+            let residuals = search.residuals(&x).map_err(Trouble::NoStart)?;
+            search.weigh(items, &residuals, true);
+            let found = minimise(&x, &from, &to, search, limits);
+            Ok(Followed { x: found.x, why: found.why, noise: search.noise.clone(), misfit: found.cost }.numbers())
+        })?;
+        let Some(found) = Followed::read(&stage) else { break };
+        search.noise = found.noise;
         if found.why == Ended::NoStart {
             break;
         }
@@ -331,10 +340,32 @@ fn paths(minima: Minima, order: usize) -> Vec<Vec<Way>> {
 
 /// Where a search from one start ended, with white noise.
 struct Followed {
-    end: End,
+    x: Vec<f64>,
+    why: Ended,
     noise: Vec<Noise>,
     /// −2 log-likelihood, up to a constant.
     misfit: f64,
+}
+
+/// How searches end, by their numbers in a stage.
+const ENDS: [Ended; 5] = [Ended::Gradient, Ended::Small, Ended::Trials, Ended::Stuck, Ended::NoStart];
+
+impl Followed {
+    /// The numbers of a stage.
+    fn numbers(&self) -> Vec<f64> {
+        let why = ENDS.iter().position(|end| *end == self.why).expect("it is one of them") as f64;
+        let noise = self.noise.iter().flat_map(of_noise);
+        [self.misfit, why].into_iter().chain(of_list(&self.x)).chain([self.noise.len() as f64]).chain(noise).collect()
+    }
+
+    /// What the numbers of a stage say; none if there are none.
+    fn read(numbers: &[f64]) -> Option<Followed> {
+        let mut numbers = Numbers(numbers);
+        let (misfit, why, x) = (numbers.one()?, *ENDS.get(numbers.one()? as usize)?, numbers.list()?);
+        let items = numbers.one()? as usize;
+        let noise = (0..items).map(|_| numbers.noise()).collect::<Option<_>>()?;
+        Some(Followed { x, why, noise, misfit })
+    }
 }
 
 /// The number of searches that ended where the best did.
@@ -386,9 +417,51 @@ struct Search<'a> {
     influence: Vec<bool>,
     runs: u64,
     failures: BTreeMap<String, u64>,
+    journal: Option<&'a mut (dyn Journal + 'a)>,
 }
 
 impl Search<'_> {
+    /// A stage of the search, or what an earlier search has kept of it: the numbers that follow from it. The rest of the
+    /// search depends on these, and on what [`Search::state`] holds, alone.
+    fn staged(&mut self, stage: impl FnOnce(&mut Self) -> Result<Vec<f64>, Trouble>) -> Result<Vec<f64>, Trouble> {
+        self.last = None;
+        let earlier = self.journal.as_mut().and_then(|journal| journal.next());
+        if let Some(numbers) = earlier.and_then(|stage| self.restore(&stage)) {
+            return Ok(numbers);
+        }
+        let numbers = stage(self)?;
+        self.last = None;
+        let stage = self.state(&numbers);
+        if let Some(journal) = &mut self.journal {
+            journal.note(&stage);
+        }
+        Ok(numbers)
+    }
+
+    /// What a stage leaves, with its numbers.
+    fn state(&self, numbers: &[f64]) -> Stage {
+        let influence: Vec<f64> = self.influence.iter().map(|has| f64::from(u8::from(*has))).collect();
+        Stage {
+            numbers: [vec![self.runs as f64], influence, self.sizes.clone(), numbers.to_vec()].concat(),
+            words: self.failures.iter().map(|(why, times)| format!("{times} {why}")).collect(),
+        }
+    }
+
+    /// Enters what a stage has left; returns its numbers. None for a stage of another question.
+    fn restore(&mut self, stage: &Stage) -> Option<Vec<f64>> {
+        let n = self.sizes.len();
+        let mut numbers = Numbers(&stage.numbers);
+        let (runs, influence, sizes) = (numbers.one()?, numbers.some(n)?, numbers.some(n)?);
+        let failure = |word: &String| {
+            let (times, why) = word.split_once(' ')?;
+            Some((why.to_string(), times.parse().ok()?))
+        };
+        self.failures = stage.words.iter().map(failure).collect::<Option<_>>()?;
+        self.influence = influence.iter().map(|has| *has != 0.0).collect();
+        (self.runs, self.sizes) = (runs as u64, sizes);
+        Some(numbers.0.to_vec())
+    }
+
     fn values(&self, x: &[f64]) -> Vec<f64> {
         self.scale.values(x)
     }
@@ -468,11 +541,19 @@ impl Search<'_> {
         let (mut misfits, mut rows) = (Vec::new(), 0);
         for first in (0..starts.len()).step_by(JUDGED_AT_ONCE) {
             let some = &starts[first..starts.len().min(first + JUDGED_AT_ONCE)];
-            for (k, residuals) in self.run_all(some).into_iter().enumerate() {
-                let Ok(residuals) = residuals else { continue };
-                rows = residuals.iter().map(Vec::len).sum();
-                misfits.push((first + k, self.misfit(items, &residuals)));
-            }
+            let stage = self.staged(|search| {
+                let (mut all, mut rows) = (Vec::new(), 0);
+                for (k, residuals) in search.run_all(some).into_iter().enumerate() {
+                    let Ok(residuals) = residuals else { continue };
+                    rows = residuals.iter().map(Vec::len).sum();
+                    all.extend([(first + k) as f64, search.misfit(items, &residuals)]);
+                }
+                Ok([vec![rows as f64], all].concat())
+            });
+            let stage = stage.unwrap_or_default();
+            let Some((count, all)) = stage.split_first() else { continue };
+            rows = rows.max(*count as usize);
+            misfits.extend(all.chunks_exact(2).map(|pair| (pair[0] as usize, pair[1])));
         }
         if misfits.is_empty() {
             return Err(self.commonest());
@@ -517,7 +598,7 @@ impl Search<'_> {
                     None => rows.len() as f64 * (self.scale.with.log)(mean_square(rows).max(f64::MIN_POSITIVE)),
                 };
                 let misfit = items.iter().zip(&residuals).map(of).sum();
-                return Ok(Some(Followed { end, noise: self.noise.clone(), misfit }));
+                return Ok(Some(Followed { x: end.x, why: end.why, noise: self.noise.clone(), misfit }));
             }
         }
         unreachable!("the rounds end")
@@ -877,6 +958,7 @@ mod tests {
             starts: 1,
             seed: 0,
             estimator: Estimator::Chosen,
+            journal: None,
         })
     }
 
@@ -955,6 +1037,7 @@ mod tests {
                     starts,
                     seed,
                     estimator: Estimator::Chosen,
+                    journal: None,
                 };
                 let answer = fit(question).unwrap();
                 let found = (answer.values[0] - omega).abs() < 0.02;
@@ -1023,10 +1106,11 @@ mod tests {
                     influence: vec![false],
                     runs: 0,
                     failures: BTreeMap::new(),
+                    journal: None,
                 };
                 let begin = search.along(items, &scale.coordinates(&[start]), path).expect("it runs");
                 let end = search.follow(items, begin, LIMITS).unwrap().expect("it runs");
-                found[k] += u32::from((scale.values(&end.end.x)[0] / omega - 1.0).abs() < 0.01);
+                found[k] += u32::from((scale.values(&end.x)[0] / omega - 1.0).abs() < 0.01);
             }
         }
         assert!(found[0] < 20 && found[1] >= 32 && found[2] >= 36, "of 40: {found:?}");
@@ -1087,6 +1171,7 @@ mod tests {
             starts: 1,
             seed: 0,
             estimator: Estimator::Chosen,
+            journal: None,
         };
         assert_eq!(fit(question), Err(Trouble::NoInfluence(vec![1])));
         let mut never =
@@ -1103,6 +1188,7 @@ mod tests {
             starts: 1,
             seed: 0,
             estimator: Estimator::Chosen,
+            journal: None,
         };
         assert_eq!(fit(question), Err(Trouble::NoStart("too many steps".into())));
     }
@@ -1133,6 +1219,7 @@ mod tests {
                 starts: 16,
                 seed,
                 estimator: Estimator::Chosen,
+                journal: None,
             });
             let answer = answer.unwrap_or_else(|trouble| panic!("seed {seed}: {trouble:?}"));
             assert!(
@@ -1177,6 +1264,7 @@ mod tests {
             starts,
             seed: 0,
             estimator: Estimator::Chosen,
+            journal: None,
         })
         .expect("it has an answer")
     }
@@ -1269,6 +1357,7 @@ mod tests {
                 starts: 1,
                 seed,
                 estimator: Estimator::Chosen,
+                journal: None,
             });
             let answer = answer.expect("it has an answer");
             let moved = asked(&[PLAIN; 3], Rows::Independent, 1, &other);

@@ -10,6 +10,7 @@ pub mod least_squares;
 pub mod trust_region;
 pub mod noise;
 pub mod sandwich;
+pub mod journal;
 pub mod estimate;
 pub mod statistics;
 pub mod ranking;
@@ -17,6 +18,7 @@ pub mod information;
 pub mod cma_es;
 
 pub use estimate::{Answer, Combination, Estimator, Finer, Item, Minima, Question, Residuals, Rows, Trouble, Way, fit};
+pub use journal::{Journal, Stage};
 pub use noise::Noise;
 pub use trust_region::{Ended, Limits};
 pub use unknowns::{Elementary, Unknown};

@@ -1,5 +1,6 @@
 //! `fric fit FILE.csv`: the standard laws, fitted to a recording and ranked by what they predict.
 
+use super::kept::Keeping;
 use super::rank::{self, Heading, Tried};
 use super::search::{Runs, Settings, search};
 use super::{after, chosen, laws};
@@ -47,22 +48,33 @@ pub fn of_laws(args: &args::Fit, terminal: &mut Terminal) -> End {
         }
     };
     let mut tried: Vec<Tried> = Vec::new();
+    let mut keeping = Keeping::new(args);
     for name in names {
         let compiled = match compile::fit(&mut loaded, &crate::disk::Disk, &name, &options, &mut Vec::new()) {
-            // A fit of a law has no alternatives.
-            Ok(compiled) => compiled.into_iter().next().expect("it has been compiled"),
+            Ok(compiled) => compiled,
             Err(errors) => {
                 reported(&loaded, &errors, terminal);
                 return End::Failed;
             }
         };
+        let kept = match keeping.begin(&loaded, &name, &compiled, terminal) {
+            Ok(kept) => kept,
+            Err(why) => {
+                terminal.error(&why);
+                return End::Failed;
+            }
+        };
         let begin = Instant::now();
-        let runs = Runs::new(compiled, args.threads);
+        // A fit of a law has no alternatives.
+        let mut runs = Runs::new(compiled.into_iter().next().expect("it has been compiled"), args.threads);
+        runs.keep(kept);
         let found = search(&runs, Settings::of(args));
         let held_out = found.as_ref().ok().and_then(|found| after::held_out(&runs, found, Settings::of(args)));
         let law = runs.parts[0].asks.model.clone();
         tried.push(Tried { name, law, runs, found, held_out, seconds: begin.elapsed().as_secs_f64() });
     }
     let heading = Heading { title: &name, wrote: Some(&place) };
-    rank::rank(args, &heading, (&place, &[]), &loaded, &tried, terminal)
+    let end = rank::rank(args, &heading, (&place, &[]), &loaded, &tried, terminal);
+    keeping.finish(terminal);
+    end
 }

@@ -3,6 +3,7 @@
 //! In: a compiled fit. Out: what its runs leave of the recording, and an answer with the step that it needs. Knows nothing
 //! of files.
 
+use super::kept::Kept;
 use crate::args::{self, STARTS, STARTS_WITH_REGIMES};
 use crate::compile::{self, ElementaryFunction, HELD, Varying};
 use abi::plan::{Experiment, Method, Solver};
@@ -10,7 +11,9 @@ use abi::{Instance, Slot};
 use grammar::span::Span;
 use runtime::engine::{self, Cause, Continue, Failure, lanes};
 use runtime::fit::statistics::intervals;
-use runtime::fit::{Answer, Elementary, Estimator, Finer, Item, Limits, Minima, Question, Rows, Trouble, Unknown, Way};
+use runtime::fit::{
+    Answer, Elementary, Estimator, Finer, Item, Journal, Limits, Minima, Question, Rows, Trouble, Unknown, Way,
+};
 use std::ops::Range;
 
 /// When a search ends.
@@ -40,6 +43,8 @@ pub struct Runs {
     pub name: Span,
     /// Lints that the fit allows.
     pub allowed: Vec<String>,
+    /// Where the stages of its searches are kept.
+    pub kept: Option<Kept>,
 }
 
 /// The runs against one recording.
@@ -307,7 +312,13 @@ impl Runs {
         let judged = judged.into_iter().map(|fit| Runs::new(fit, threads)).collect();
         let threads = threads.unwrap_or_else(|| std::thread::available_parallelism().map_or(1, usize::from));
         let parts = parts.into_iter().map(|part| Part::new(part, threads)).collect();
-        Runs { label, judged, parts, unknowns, name, allowed }
+        Runs { label, judged, parts, unknowns, name, allowed, kept: None }
+    }
+
+    /// Keeps the stages of all searches.
+    pub fn keep(&mut self, kept: Option<Kept>) {
+        self.judged.iter_mut().for_each(|judged| judged.keep(kept.clone()));
+        self.kept = kept;
     }
 
     /// The steps as the text has them; of adaptive runs their tolerances.
@@ -511,7 +522,9 @@ pub(super) fn estimate(
     (run, finer): (&mut Model, Option<&mut Finer>),
 ) -> Result<Answer, Trouble> {
     let (exp, log) = (ElementaryFunction::exp(), ElementaryFunction::log());
+    let mut kept = runs.kept.clone();
     runtime::fit::fit(Question {
+        journal: kept.as_mut().map(|kept| kept as &mut dyn Journal),
         unknowns,
         items,
         minima: runs.minima(),
