@@ -8,6 +8,7 @@ mod support;
 use abi::description::Slot;
 use abi::live::Tunable;
 use compiler::{Changes, CompiledRig, NoSources, Options};
+use runtime::hil::line::assignments;
 use runtime::hil::live::{Judge, Objection, TOLD};
 use runtime::rng::Chance;
 
@@ -138,7 +139,7 @@ fn differ(text: &str, ready: &CompiledRig, set: &[String]) -> Result<Outcome, St
         codes.dedup();
         codes
     };
-    let values = match judge.read(&set.join(", ")) {
+    let values = match assignments(&set.join(", ")).and_then(|all| judge.read(&all)) {
         Ok(values) => values,
         Err(why) if why.starts_with("only a start") => return Ok(Outcome::Start),
         Err(why) => {
@@ -295,7 +296,7 @@ fn a_start_value_is_set_at_the_start_only() {
     let found = start(&text, &["fr.z = 500 N·m".into()]).err().expect("it lies beyond the range");
     assert!(found.iter().any(|d| d.code == "E0502" && d.message.contains("`z` of Rub")), "{found:#?}");
     let judge = Judge::new(ready.live.clone(), ready.judge.clone(), &ready.control).unwrap();
-    let said = judge.read("fr.z = 0.5 N·m").unwrap_err();
+    let said = judge.read(&assignments("fr.z = 0.5 N·m").unwrap()).unwrap_err();
     let why = "only a start reads `fr.z`: it is a state, which is given a value at the start only";
     assert_eq!(said, format!("{why}; start with `--set fr.z=0.5 N·m`"));
 }

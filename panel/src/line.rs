@@ -17,6 +17,8 @@
 //! NUMBER WORDS                            for the subject; answered under this number
 //! ```
 
+use runtime::hil::line::{self as rig, stamped};
+
 /// Most views of a page, and most signals of one.
 pub const VIEWS: u16 = 32;
 /// Most signals of a view.
@@ -166,10 +168,13 @@ pub fn read(text: &str) -> Result<Line<'_>, String> {
 
 /// Words for a rig: the end of the data that the page has seen, s, and the command.
 pub fn seen(words: &str) -> (Option<f64>, &str) {
-    match words.strip_prefix('@').and_then(|rest| rest.split_once(' ')) {
-        Some((seen, rest)) => (seen.parse().ok(), rest.trim()),
-        None => (None, words.trim()),
-    }
+    let (seen, words) = stamped(words);
+    (seen.and_then(|seen| seen.parse().ok()), words)
+}
+
+/// Whether the words stop a rig.
+pub fn stops(words: &str) -> bool {
+    rig::Line::read(seen(words).1) == Ok(rig::Line::Stop)
 }
 
 /// A finite number.

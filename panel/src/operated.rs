@@ -34,6 +34,7 @@ use crate::words::clean;
 use abi::live::{Live, Tunable};
 use abi::{Instance, Slot};
 use runtime::hil::chair::Seats;
+use runtime::hil::line::{Door, Line, RUNS};
 use runtime::hil::origin::Seat;
 use serde_json::{Value, json};
 use std::collections::{BTreeMap, VecDeque};
@@ -368,21 +369,17 @@ impl Subject for Operated {
 
     fn say(&self, page: Page, words: &str) -> Result<String, String> {
         let (seen, words) = line::seen(words);
-        if words.chars().any(char::is_control) {
-            return Err("a command is one line".into());
+        let line = Line::read(words)?.at(Door::Page)?;
+        if line == Line::Again {
+            let inner = self.inner();
+            match (&inner.over, inner.next.as_str()) {
+                (_, "again") => {}
+                (None, _) => return Err(RUNS.into()),
+                (Some(_), _) => return Err("the rig cannot be started again now".into()),
+            }
         }
-        // A stop is obeyed with any age, and before anything else is asked.
-        let stops = words == "stop";
-        let seats = matches!(words, "take" | "give" | "refuse");
-        if words == "again" {
-            if self.inner().next != "again" {
-                return Err("the rig cannot be started again now".into());
-            }
-        } else if !stops && !seats {
-            let begins = |word: &str| words.strip_prefix(word).is_some_and(|rest| rest.starts_with(' '));
-            if words != "enable" && words != "arm" && !begins("set") && !begins("mark") {
-                return Err("say enable, arm, set PATH = VALUE, mark WORDS, take, give, refuse, again or stop".into());
-            }
+        // A stop is obeyed with any age.
+        if line.waits() {
             if let Some(over) = &self.inner().over {
                 return Err(format!("the rig has ended: {over}"));
             }
@@ -398,14 +395,14 @@ impl Subject for Operated {
             inner.last += 1;
             let number = inner.last;
             inner.changes += 1;
-            inner.open.insert(number, (page, words.into()));
+            inner.open.insert(number, (page, line.to_string()));
             if inner.open.len() > OPEN {
                 inner.open.pop_first();
             }
-            (number, inner.now.filter(|_| !stops && !seats && words != "again"))
+            (number, inner.now.filter(|_| line.waits()))
         };
         let stamp = now.map_or(String::new(), |ns| format!("@{ns} "));
-        self.say_line(&format!("{number} page {} {stamp}{words}", page.number))?;
+        self.say_line(&format!("{number} page {} {stamp}{line}", page.number))?;
         Ok(number.to_string())
     }
 }

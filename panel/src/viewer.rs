@@ -195,7 +195,7 @@ impl Viewer {
 
     fn obey(&self, text: &str, subject: &dyn Subject) {
         let (number, result) = match line::read(text) {
-            Ok(Line::Say(number, words)) if self.guest && line::seen(words).1 != "stop" => {
+            Ok(Line::Say(number, words)) if self.guest && !line::stops(words) => {
                 (Some(number), Err("this link is for looking, and for stop: whoever printed it operates".into()))
             }
             Ok(Line::Say(number, words)) => (Some(number), subject.say(self.page(), words)),

@@ -23,6 +23,7 @@ mod panel;
 
 use clap::{Parser, Subcommand, ValueHint};
 use runtime::drive::serve::Doors;
+use runtime::hil::line::{Door, Line};
 use runtime::record::parts;
 use std::net::SocketAddr;
 use std::path::PathBuf;
@@ -317,15 +318,6 @@ fn installed(args: &Install) -> Result<String, String> {
     store.install(&open.package.rig, &open.bytes, open.signature.as_deref())
 }
 
-/// Joins a command of one or several words.
-fn said(words: &[String]) -> Option<String> {
-    let what = words.join(" ");
-    let what = what.trim();
-    let known =
-        ["enable", "arm", "stop", "reset"].contains(&what) || what.starts_with("set ") || what.starts_with("mark ");
-    (known && !what.contains('\n')).then(|| what.to_string())
-}
-
 /// Serves the drives of a package.
 fn served(args: &Drives) -> Result<u8, String> {
     let open = packed::open(&args.package, &args.keys.trusted)?;
@@ -400,13 +392,19 @@ fn main() -> ExitCode {
             let trust = run::Trust { trusted: &start.trust.keys.trusted, allow_unsigned: start.trust.allow_unsigned };
             run::start(&start.store.dir, start.hash.as_deref(), trust, start.sizes.limits())
         }
-        Command::Say(say) => match said(&say.what) {
-            Some(what) => run::say(&say.store.dir, &what),
-            None => {
-                words::error("say enable, arm, stop, `set PATH = VALUE` or `mark WORDS`");
-                return ExitCode::from(2);
+        Command::Say(say) => {
+            let text = say.what.join(" ");
+            let refused = |why: &String| format!("`{}` is refused: {why}", text.trim());
+            match Line::read(&text).map_err(|why| refused(&why)) {
+                Ok(line) => {
+                    line.at(Door::Say).map_err(|why| refused(&why)).and_then(|line| run::say(&say.store.dir, &line))
+                }
+                Err(why) => {
+                    words::error(&why);
+                    return ExitCode::from(2);
+                }
             }
-        },
+        }
         Command::Doctor => Ok(doctor::doctor()),
         Command::Install(install) => installed(install),
         Command::Rollback(store) => store::Store::at(&store.dir).rollback(),

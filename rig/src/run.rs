@@ -9,10 +9,11 @@ use crate::words;
 use abi::rig::Rig;
 use runtime::can::Bus;
 use runtime::can::sim::Simulation;
-use runtime::hil::chair::{Chair, Line, Seats};
+use runtime::hil::chair::{Chair, PageLine, Seats};
 use runtime::hil::cycle::{Attention, Command, End, Gauges};
+use runtime::hil::line::{self, Door, Line};
 use runtime::hil::live::Judge;
-use runtime::hil::operator::{Answer, Mark, NO_RESET, Operator, Reason, Stamp, Stopper};
+use runtime::hil::operator::{Answer, Operator, Reason, Stamp, Stopper};
 use runtime::hil::origin::{Origin, Seat};
 use runtime::hil::session::{self, Drives, Session, Setup};
 use runtime::hil::simulated::World;
@@ -392,7 +393,7 @@ struct Waiting {
     number: u64,
     stamp: Stamp,
     origin: Origin,
-    words: String,
+    line: Line,
 }
 
 /// What a panel must know to find the log of a run.
@@ -435,13 +436,17 @@ impl Desk {
         if line.trim() == "attend" {
             return self.attend_panel(stream, lines);
         }
-        let stamped = line.trim().strip_prefix('@').and_then(|rest| rest.split_once(' '));
-        let stamped = stamped.and_then(|(ns, said)| Some((Stamp::Wall(ns.parse().ok()?), said)));
-        let (stamp, said) = stamped.unwrap_or((Stamp::wall(), line.trim()));
-        let said = match self.carry_out(said, stamp, Origin::Say) {
+        let (given, words) = line::stamped(&line);
+        let given = given.map(|ns| ns.parse().map(Stamp::Wall).map_err(|_| format!("`@{ns}` is no time of its clock")));
+        let said = Line::read(words).and_then(|line| line.at(Door::Say)).and_then(|line| match (line, given) {
+            // A stop is obeyed with any time.
+            (Line::Stop, _) => self.carry_out(&Line::Stop, Stamp::wall(), Origin::Say),
+            (line, given) => self.carry_out(&line, given.unwrap_or(Ok(Stamp::wall()))?, Origin::Say),
+        });
+        let said = match said {
             Ok(Some(cycle)) => format!("ok {cycle}\n"),
             Ok(None) => "ok\n".into(),
-            Err(why) => format!("{why}\n"),
+            Err(why) => format!("refused {why}\n"),
         };
         let _ = (&*stream).write_all(said.as_bytes());
     }
@@ -531,42 +536,52 @@ impl Desk {
                 return pages;
             }
             let (seat, now) = (|page| Seat { panel, page }, Instant::now());
-            match Line::read(text.trim()) {
-                None => {}
-                Some(Line::Seen) => self.attention.iter().for_each(|attention| attention.seen()),
-                Some(Line::Here(page)) => {
+            let (number, page, given_ns, words) = match PageLine::read(text.trim()) {
+                None => continue,
+                Some(PageLine::Seen) => {
+                    self.attention.iter().for_each(|attention| attention.seen());
+                    continue;
+                }
+                Some(PageLine::Here(page)) => {
                     pages.insert(page);
                     self.chair().heard(seat(page), now);
+                    continue;
                 }
-                Some(Line::Left(page)) => {
+                Some(PageLine::Left(page)) => {
                     pages.remove(&page);
                     self.chair().left(seat(page), now);
+                    continue;
                 }
-                Some(Line::Command { number, page, words: "stop", .. }) => {
+                Some(PageLine::Command { number, page, given_ns, words }) => (number, page, given_ns, words),
+            };
+            let refuse = |why: &str| _ = tell_panel(to, &format!("refused {number} {why}"));
+            let line = match Line::read(words).and_then(|line| line.at(Door::Page)) {
+                Ok(Line::Stop) => {
                     self.stopper.stop(Origin::Page(seat(page)));
                     tell_panel(to, &format!("ok {number}"));
+                    continue;
                 }
-                Some(Line::Command { number, page, given_ns, words }) => {
-                    pages.insert(page);
-                    let mut chair = self.chair();
-                    let seats = chair.says(seat(page), words, now);
-                    let only = seats.is_some();
-                    let may = seats.unwrap_or_else(|| chair.command(seat(page), now));
-                    drop(chair);
-                    let refused = match may {
-                        Err(why) => Some(why),
-                        Ok(()) if only => {
-                            tell_panel(to, &format!("ok {number}"));
-                            None
-                        }
-                        Ok(()) => {
-                            let stamp = given_ns.map_or_else(Stamp::wall, Stamp::Wall);
-                            let said = Waiting { number, stamp, origin: Origin::Page(seat(page)), words: words.into() };
-                            let full = send.try_send(said).is_err();
-                            full.then(|| format!("{WAITING} commands wait already: say it again"))
-                        }
-                    };
-                    refused.iter().for_each(|why| _ = tell_panel(to, &format!("refused {number} {why}")));
+                Ok(line) => line,
+                Err(why) => {
+                    refuse(&why);
+                    continue;
+                }
+            };
+            pages.insert(page);
+            let mut chair = self.chair();
+            let seats = chair.says(seat(page), &line, now);
+            let only = seats.is_some();
+            let may = seats.unwrap_or_else(|| chair.command(seat(page), now));
+            drop(chair);
+            match may {
+                Err(why) => refuse(&why),
+                Ok(()) if only => _ = tell_panel(to, &format!("ok {number}")),
+                Ok(()) => {
+                    let stamp = given_ns.map_or_else(Stamp::wall, Stamp::Wall);
+                    let said = Waiting { number, stamp, origin: Origin::Page(seat(page)), line };
+                    if send.try_send(said).is_err() {
+                        refuse(&format!("{WAITING} commands wait already: say it again"));
+                    }
                 }
             }
         }
@@ -574,38 +589,37 @@ impl Desk {
 
     /// Carries out commands in their order.
     fn answer(&self, to: &Mutex<&UnixStream>, queue: &mpsc::Receiver<Waiting>) {
-        for Waiting { number, stamp, origin, words } in queue {
-            match self.carry_out(&words, stamp, origin) {
+        for Waiting { number, stamp, origin, line } in queue {
+            match self.carry_out(&line, stamp, origin) {
                 Ok(Some(cycle)) => tell_panel(to, &format!("ok {number} {cycle}")),
                 Ok(None) => tell_panel(to, &format!("ok {number}")),
-                Err(why) => tell_panel(to, &format!("refused {number} {}", why.trim_start_matches("refused: "))),
+                Err(why) => tell_panel(to, &format!("refused {number} {why}")),
             };
         }
     }
 
     /// Executes a command that was given at this time. Returns the cycle of the log that took it, if one did.
-    fn carry_out(&self, said: &str, stamp: Stamp, origin: Origin) -> Result<Option<u64>, String> {
+    fn carry_out(&self, said: &Line, stamp: Stamp, origin: Origin) -> Result<Option<u64>, String> {
         let command = match said {
-            "enable" => Command::Enable,
-            "arm" => Command::Arm,
-            "reset" => return Err(format!("refused: {NO_RESET}")),
+            Line::Enable => Command::Enable,
+            Line::Arm => Command::Arm,
+            Line::Set(wanted) => Command::Set(self.judge.read(wanted)?),
+            Line::Mark(mark) => Command::Mark(*mark),
             // Clients do not wait for each other.
-            "stop" => {
+            Line::Stop => {
                 self.stopper.stop(origin);
                 return Ok(None);
             }
-            _ => match said.strip_prefix("set ") {
-                Some(set) => Command::Set(self.judge.read(set)?),
-                None => match said.strip_prefix("mark ") {
-                    Some(mark) => Command::Mark(Mark::new(mark)?),
-                    None => return Err("say enable, arm, set PATH = VALUE, mark WORDS or stop".into()),
-                },
-            },
+            Line::Again => return Err(line::RUNS.into()),
+            // Refused where they are read, and of the chair alone.
+            Line::Reset | Line::Show | Line::Help | Line::Quit | Line::Take | Line::Give | Line::Refuse => {
+                return said.clone().at(Door::Say).map(|_| None);
+            }
         };
         let operator = || self.operator.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
         let refused = |why: Reason| match why {
-            Reason::Set(objection) => format!("refused: {}", self.judge.words(&objection)),
-            why => format!("refused: {}", why.words()),
+            Reason::Set(objection) => self.judge.words(&objection),
+            why => why.words(),
         };
         let ticket = {
             let mut operator = operator();
@@ -628,7 +642,7 @@ impl Desk {
 pub const MOST_SAID: u64 = 1 << 16;
 
 /// Sends a command to the running rig.
-pub fn say(dir: &Path, what: &str) -> Result<String, String> {
+pub fn say(dir: &Path, what: &Line) -> Result<String, String> {
     let about = |error: std::io::Error| format!("no rig runs in {}: {error}", dir.display());
     let Stamp::Wall(now_ns) = Stamp::wall() else { unreachable!("that is what it gives") };
     let mut stream = UnixStream::connect(socket(dir)).map_err(about)?;
@@ -642,15 +656,18 @@ pub fn say(dir: &Path, what: &str) -> Result<String, String> {
         "ok" => String::new(),
         line => match line.strip_prefix("ok ") {
             Some(cycle) => format!("  by cycle {cycle} of the log\n"),
-            None => return Err(line.into()),
+            None => {
+                let why = line.strip_prefix("refused ").unwrap_or(line);
+                return Err(format!("`{what}` is refused: {why}"));
+            }
         },
     };
-    match what.starts_with("set ") {
+    match what {
         // A stability check requires the compiler.
-        true => Ok(format!(
+        Line::Set(_) => Ok(format!(
             "{what}\n{taken}  not judged: whether the fixed step (E0702) and the contacts are stable with it; `fric predict --set` is\n"
         )),
-        false => Ok(format!("{what}\n{taken}")),
+        _ => Ok(format!("{what}\n{taken}")),
     }
 }
 

@@ -10,8 +10,9 @@
 
 use crate::args::Hil as Args;
 use crate::terminal::Terminal;
-use runtime::hil::chair::{Chair, Line};
+use runtime::hil::chair::{Chair, PageLine};
 use runtime::hil::cycle::Gauges;
+use runtime::hil::line::{Door, Line};
 use runtime::hil::origin::{Origin, Seat};
 use std::io::{BufRead, BufReader, Write};
 use std::os::unix::process::CommandExt;
@@ -41,8 +42,8 @@ impl Told {
 
 /// A command of a viewer.
 pub struct Asked {
-    /// The command as it is typed at the prompt.
-    pub text: String,
+    /// The command.
+    pub line: Line,
     /// Whose it is.
     pub seat: Seat,
     number: u64,
@@ -150,21 +151,25 @@ impl Beside {
     /// A line about a page.
     fn hear(told: &Told, line: &str, chair: &mut Chair, waiting: &Arc<AtomicUsize>, hear: &Hear) {
         let (seat, now) = (|page| Seat { panel: 0, page }, Instant::now());
-        let (number, page, words) = match Line::read(line) {
+        let (number, page, words) = match PageLine::read(line) {
             None => return,
-            Some(Line::Seen) => return (hear.seen)(),
-            Some(Line::Here(page)) => {
+            Some(PageLine::Seen) => return (hear.seen)(),
+            Some(PageLine::Here(page)) => {
                 chair.heard(seat(page), now);
                 return;
             }
-            Some(Line::Left(page)) => return chair.left(seat(page), now),
-            Some(Line::Command { number, page, words, .. }) => (number, seat(page), words),
+            Some(PageLine::Left(page)) => return chair.left(seat(page), now),
+            Some(PageLine::Command { number, page, words, .. }) => (number, seat(page), words),
         };
-        if words == "stop" {
-            (hear.stop)(Origin::Page(page));
-            return told.say(&format!("ok {number}"));
-        }
-        let seats = chair.says(page, words, now);
+        let line = match Line::read(words).and_then(|line| line.at(Door::Page)) {
+            Ok(Line::Stop) => {
+                (hear.stop)(Origin::Page(page));
+                return told.say(&format!("ok {number}"));
+            }
+            Ok(line) => line,
+            Err(why) => return told.say(&format!("refused {number} {why}")),
+        };
+        let seats = chair.says(page, &line, now);
         let only = seats.is_some();
         match seats.unwrap_or_else(|| chair.command(page, now)) {
             Err(why) => told.say(&format!("refused {number} {why}")),
@@ -174,8 +179,8 @@ impl Beside {
                 told.say(&format!("refused {number} {WAITING} commands wait already: say it again"));
             }
             Ok(()) => {
-                let (text, told, waiting) = (words.to_string(), told.clone(), waiting.clone());
-                (hear.ask)(Asked { text, seat: page, number, told, waiting });
+                let (told, waiting) = (told.clone(), waiting.clone());
+                (hear.ask)(Asked { line, seat: page, number, told, waiting });
             }
         }
     }

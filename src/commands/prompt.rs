@@ -13,8 +13,9 @@ use abi::Instance;
 use abi::format::quantity;
 use abi::live::{Param, Tunable};
 use grammar::diagnostic::Diagnostic;
+use runtime::hil::line::{Assignment, Door, Line, RUNS};
 use runtime::hil::live::{Judge, Set};
-use runtime::hil::operator::{Answer, Command, Mark, NO_RESET, Operator, Reason, Stopper};
+use runtime::hil::operator::{Answer, Command, Operator, Reason, Stopper};
 use runtime::hil::origin::Origin;
 use runtime::record::log::Sections;
 use std::io::BufRead;
@@ -51,12 +52,12 @@ pub struct Rehearsal {
 }
 
 impl Rehearsal {
-    /// The values of a start, with those of `set PATH = VALUE, …` replaced.
-    fn with(&self, set: &str) -> Vec<(String, String)> {
+    /// The values of a start, with these replaced.
+    fn with(&self, set: &[Assignment]) -> Vec<(String, String)> {
         let mut all = self.set.clone();
-        for (path, value) in set.split(',').filter_map(|one| one.split_once('=')) {
-            all.retain(|(other, _)| other != path.trim());
-            all.push((path.trim().into(), value.trim().into()));
+        for Assignment { path, value } in set {
+            all.retain(|(other, _)| other != path);
+            all.push((path.clone(), value.clone()));
         }
         all
     }
@@ -107,9 +108,9 @@ impl Rehearsal {
     }
 
     /// Sends a set to the cycle if a start would accept it. Returns what has changed, in words, and the cycle.
-    fn change(&mut self, operator: &mut Operator, text: &str) -> Result<Done, String> {
-        let set = self.judge.read(text)?;
-        let all = self.with(text);
+    fn change(&mut self, operator: &mut Operator, wanted: &[Assignment]) -> Result<Done, String> {
+        let set = self.judge.read(wanted)?;
+        let all = self.with(wanted);
         self.judge(&set, &all)?;
         let cycle = match operator.wait(Command::Set(set)) {
             Answer::Taken(cycle) => cycle,
@@ -140,9 +141,9 @@ struct Done {
     cycle: Option<u64>,
 }
 
-/// A command: typed here, or by a viewer of the panel.
-enum Line {
-    Typed(String),
+/// A command: typed here, with what it says, or by a viewer of the panel.
+enum Said {
+    Typed(String, Result<Line, String>),
     Asked(Asked),
 }
 
@@ -158,7 +159,7 @@ pub enum Wish {
 /// The run that is under way.
 struct Run {
     stopper: Stopper,
-    lines: Sender<Line>,
+    lines: Sender<Said>,
 }
 
 /// The run that is under way, if any, and a stop that was said before the next one could hear it.
@@ -222,16 +223,15 @@ impl Desk {
         let under = self.under();
         match &under.run {
             Some(run) => {
-                let _ = run.lines.send(Line::Asked(asked));
+                let _ = run.lines.send(Said::Asked(asked));
             }
             None => {
                 drop(under);
-                match asked.text.as_str() {
-                    "again" => {
-                        self.wish(Wish::Again);
-                        asked.answer(&Ok(None));
-                    }
-                    _ => asked.answer(&Err(Reason::Ended.words())),
+                if asked.line == Line::Again {
+                    self.wish(Wish::Again);
+                    asked.answer(&Ok(None));
+                } else {
+                    asked.answer(&Err(Reason::Ended.words()));
                 }
             }
         }
@@ -240,19 +240,23 @@ impl Desk {
     /// Reads what is typed, until that ends: for a thread of its own.
     pub fn listen(&self) {
         for line in std::io::stdin().lock().lines() {
-            let Ok(line) = line else { break };
-            let line = line.trim();
+            let Ok(text) = line else { break };
+            let text = text.trim();
+            if text.is_empty() {
+                continue;
+            }
+            let line = Line::read(text).and_then(|line| line.at(Door::Prompt));
             let under = self.under();
             match (&under.run, line) {
-                (_, "") => {}
-                (Some(run), "stop" | "quit") => run.stopper.stop(Origin::Prompt),
+                (Some(run), Ok(Line::Stop | Line::Quit)) => run.stopper.stop(Origin::Prompt),
                 (Some(run), line) => {
-                    let _ = run.lines.send(Line::Typed(line.into()));
+                    let _ = run.lines.send(Said::Typed(text.into(), line));
                 }
-                (None, "again") => self.wish(Wish::Again),
-                (None, "stop" | "quit") => self.wish(Wish::Quit),
+                (None, Ok(Line::Again)) => self.wish(Wish::Again),
+                (None, Ok(Line::Stop | Line::Quit)) => self.wish(Wish::Quit),
                 (None, line) => {
-                    Terminal::new().error(&format!("`{line}` is refused: no rig runs. Type again or quit"));
+                    let why = line.err().unwrap_or_else(|| "no rig runs. Type again or quit".into());
+                    Terminal::new().error(&format!("`{text}` is refused: {why}"));
                 }
             }
         }
@@ -260,49 +264,52 @@ impl Desk {
 }
 
 /// Executes lines in order, and reports the result of each.
-fn carry_out(mut operator: Operator, mut rehearsal: Option<Rehearsal>, typed: &Receiver<Line>) {
+fn carry_out(mut operator: Operator, mut rehearsal: Option<Rehearsal>, said: &Receiver<Said>) {
     let mut terminal = Terminal::new();
-    for line in typed {
-        let text = match &line {
-            Line::Typed(text) => text,
-            Line::Asked(asked) => &asked.text,
+    for said in said {
+        let (text, line, origin) = match &said {
+            Said::Typed(text, line) => (text.clone(), line.clone(), Origin::Prompt),
+            Said::Asked(asked) => (asked.line.to_string(), Ok(asked.line.clone()), Origin::Page(asked.seat)),
         };
-        operator.speaks_for(match &line {
-            Line::Typed(_) => Origin::Prompt,
-            Line::Asked(asked) => Origin::Page(asked.seat),
-        });
-        let mut wait = |command| match operator.wait(command) {
-            Answer::Taken(cycle) => Ok(Done { words: String::new(), cycle }),
-            Answer::Refused(why) => Err(why.words()),
-        };
-        let only = |words: String| Ok(Done { words, cycle: None });
-        let done = match (text.as_str(), text.strip_prefix("set "), &mut rehearsal) {
-            ("enable", ..) => wait(Command::Enable),
-            ("arm", ..) => wait(Command::Arm),
-            (text, ..) if text == "mark" || text.starts_with("mark ") => {
-                Mark::new(&text[4..]).and_then(|mark| wait(Command::Mark(mark)))
+        operator.speaks_for(origin);
+        let done = line.and_then(|line| obeyed(&line, &mut operator, &mut rehearsal));
+        match (&done, &said) {
+            (Ok(done), Said::Typed(..)) if done.words.is_empty() => {}
+            (Ok(done), Said::Typed(..)) => terminal.line(&format!("  {}", done.words.trim())),
+            (Ok(done), Said::Asked(asked)) if done.words.is_empty() => {
+                terminal.line(&format!("  panel, {}: {text}", asked.seat))
             }
-            ("reset", ..) => Err(NO_RESET.into()),
-            ("again", ..) => Err("the rig runs: stop it first".into()),
-            ("help", ..) => only(HELP.into()),
-            ("show", _, Some(rehearsal)) => only(rehearsal.shown()),
-            (_, Some(set), Some(rehearsal)) => rehearsal.change(&mut operator, set),
-            (_, Some(_), None) => Err(Reason::Unjudged.words()),
-            (_, None, _) => Err("type enable, arm, set PATH = VALUE, mark WORDS, show, help or stop".into()),
-        };
-        match (&done, &line) {
-            (Ok(done), Line::Typed(_)) if done.words.is_empty() => {}
-            (Ok(done), Line::Typed(_)) => terminal.line(&format!("  {}", done.words.trim())),
-            (Ok(done), Line::Asked(asked)) if done.words.is_empty() => {
-                terminal.line(&format!("  panel, {}: {}", asked.seat, asked.text))
-            }
-            (Ok(done), Line::Asked(asked)) => {
-                terminal.line(&format!("  panel, {}: {} ({})", asked.seat, asked.text, done.words.trim()))
+            (Ok(done), Said::Asked(asked)) => {
+                terminal.line(&format!("  panel, {}: {text} ({})", asked.seat, done.words.trim()))
             }
             (Err(why), _) => terminal.error(&format!("`{text}` is refused: {why}")),
         }
-        if let Line::Asked(asked) = line {
+        if let Said::Asked(asked) = said {
             asked.answer(&done.map(|done| done.cycle));
+        }
+    }
+}
+
+/// Obeys a line.
+fn obeyed(line: &Line, operator: &mut Operator, rehearsal: &mut Option<Rehearsal>) -> Result<Done, String> {
+    let mut wait = |command| match operator.wait(command) {
+        Answer::Taken(cycle) => Ok(Done { words: String::new(), cycle }),
+        Answer::Refused(why) => Err(why.words()),
+    };
+    let only = |words: String| Ok(Done { words, cycle: None });
+    match (line, rehearsal) {
+        (Line::Enable, _) => wait(Command::Enable),
+        (Line::Arm, _) => wait(Command::Arm),
+        (Line::Mark(mark), _) => wait(Command::Mark(*mark)),
+        (Line::Set(wanted), Some(rehearsal)) => rehearsal.change(operator, wanted),
+        (Line::Show, Some(rehearsal)) => only(rehearsal.shown()),
+        (Line::Set(_) | Line::Show, None) => Err(Reason::Unjudged.words()),
+        (Line::Help, _) => only(HELP.into()),
+        (Line::Again, _) => Err(RUNS.into()),
+        (Line::Stop | Line::Quit, _) => wait(Command::Stop),
+        // Refused where they are read, and of the chair alone.
+        (Line::Reset | Line::Take | Line::Give | Line::Refuse, _) => {
+            line.clone().at(Door::Prompt).and(only(String::new()))
         }
     }
 }

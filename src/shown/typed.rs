@@ -5,6 +5,7 @@
 use crate::quantity;
 use panel::knob::Knob;
 use panel::words::clean;
+use runtime::hil::line::{Assignment, assignments};
 
 /// A typed value in SI.
 ///
@@ -40,19 +41,16 @@ fn value(knob: &Knob, text: &str) -> Result<f64, String> {
 /// # Errors
 /// What is wrong with it; then nothing is set.
 pub fn set(text: &str, knobs: &[Knob]) -> Result<Vec<(usize, f64)>, String> {
-    let one = |text: &str| {
-        let Some((path, value)) = text.split_once('=') else {
-            return Err(format!("`{}` sets nothing: write it as PATH = VALUE", clean(text.trim())));
-        };
-        let path = path.trim();
+    let one = |Assignment { path, value }: Assignment| {
+        let path = path.as_str();
         let Some(at) = knobs.iter().position(|knob| knob.path == path) else {
             let near = crate::compile::nearest(path, knobs.iter().map(|knob| knob.path.as_str()));
             let help = near.map_or(String::new(), |near| format!("; did you mean `{near}`?"));
             return Err(format!("there is no parameter `{}` to set{help}", clean(path)));
         };
-        Ok((at, self::value(&knobs[at], value.trim())?))
+        Ok((at, self::value(&knobs[at], &value)?))
     };
-    text.split(',').map(one).collect()
+    assignments(text)?.into_iter().map(one).collect()
 }
 
 #[cfg(test)]
@@ -88,10 +86,10 @@ mod tests {
             ("fr.Fs = 0.3", "`fr.Fs` is"),
             ("fr.Fs = 0.3 s", "type it as in 0.42 N·m"),
             ("fr.Fx = 0.3 N·m", "did you mean `fr.Fs`?"),
-            ("fr.Fs 0.3 N·m", "write it as PATH = VALUE"),
+            ("fr.Fs 0.3 N·m", "write `set PATH = VALUE`"),
             ("Ti = 1 s, fr.Fs = x", "does not begin with a number"),
             ("on = 2", "true or false"),
-            ("", "sets nothing"),
+            ("", "write `set PATH = VALUE, PATH = VALUE`"),
         ] {
             let found = set(text, &all);
             assert!(found.as_ref().is_err_and(|found| found.contains(why)), "{text}: {found:?}");

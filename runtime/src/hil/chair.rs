@@ -4,6 +4,7 @@
 //! takes a chair that is free. Taking it over asks the page that sits there, which has [`PATIENCE`] to refuse; a page that
 //! is silent for that long has left. Stopping a rig needs no chair.
 
+use super::line::{Line, stamped};
 use super::origin::Seat;
 use std::fmt;
 use std::time::{Duration, Instant};
@@ -156,7 +157,7 @@ impl Seats {
 
 /// A line of a page to its rig.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
-pub enum Line<'a> {
+pub enum PageLine<'a> {
     /// `seen`: a page has drawn a picture.
     Seen,
     /// `here PAGE`: it is there.
@@ -176,36 +177,36 @@ pub enum Line<'a> {
     },
 }
 
-impl<'a> Line<'a> {
+impl<'a> PageLine<'a> {
     /// Reads a line; none if it is of another kind.
-    pub fn read(text: &'a str) -> Option<Line<'a>> {
+    pub fn read(text: &'a str) -> Option<PageLine<'a>> {
         let (first, rest) = text.split_once(' ').unwrap_or((text, ""));
         match first {
-            "seen" if rest.is_empty() => Some(Line::Seen),
-            "here" => rest.parse().ok().map(Line::Here),
-            "left" => rest.parse().ok().map(Line::Left),
+            "seen" if rest.is_empty() => Some(PageLine::Seen),
+            "here" => rest.parse().ok().map(PageLine::Here),
+            "left" => rest.parse().ok().map(PageLine::Left),
             number => {
                 let number = number.parse().ok()?;
                 let (page, words) = rest.strip_prefix("page ")?.split_once(' ')?;
-                let stamped = words.strip_prefix('@').and_then(|rest| rest.split_once(' '));
-                let (given_ns, words) = match stamped {
-                    Some((ns, words)) => (Some(ns.parse().ok()?), words),
-                    None => (None, words),
+                let (given_ns, words) = match stamped(words) {
+                    (Some(ns), words) => (Some(ns.parse().ok()?), words),
+                    (None, words) => (None, words),
                 };
-                Some(Line::Command { number, page: page.parse().ok()?, given_ns, words })
+                Some(PageLine::Command { number, page: page.parse().ok()?, given_ns, words })
             }
         }
     }
 }
 
 impl Chair {
-    /// Whether these words are of the chair alone; then what they do with it.
-    pub fn says(&mut self, page: Seat, words: &str, now: Instant) -> Option<Result<(), String>> {
-        match words {
-            "take" => Some(self.take(page, now)),
-            "give" => Some(self.answer(page, true, now)),
-            "refuse" => Some(self.answer(page, false, now)),
-            _ => None,
+    /// Whether this is said to the chair alone; then what it does with it.
+    pub fn says(&mut self, page: Seat, line: &Line, now: Instant) -> Option<Result<(), String>> {
+        match line {
+            Line::Take => Some(self.take(page, now)),
+            Line::Give => Some(self.answer(page, true, now)),
+            Line::Refuse => Some(self.answer(page, false, now)),
+            Line::Enable | Line::Arm | Line::Stop | Line::Reset | Line::Set(_) | Line::Mark(_) => None,
+            Line::Again | Line::Show | Line::Help | Line::Quit => None,
         }
     }
 }
@@ -361,16 +362,19 @@ mod tests {
             let (number, page, given_ns) = (random.number(), random.below(1 << 32) as u32, random.number());
             let words = ["stop", "set a = 1 N, b = 2", "mark @ 3 o'clock"][random.below(3) as usize];
             let line = format!("{number} page {page} @{given_ns} {words}");
-            assert_eq!(Line::read(&line), Some(Line::Command { number, page, given_ns: Some(given_ns), words }));
+            assert_eq!(
+                PageLine::read(&line),
+                Some(PageLine::Command { number, page, given_ns: Some(given_ns), words })
+            );
             let line = format!("{number} page {page} {words}");
-            assert_eq!(Line::read(&line), Some(Line::Command { number, page, given_ns: None, words }));
-            assert_eq!(Line::read(&format!("here {page}")), Some(Line::Here(page)));
-            assert_eq!(Line::read(&format!("left {page}")), Some(Line::Left(page)));
+            assert_eq!(PageLine::read(&line), Some(PageLine::Command { number, page, given_ns: None, words }));
+            assert_eq!(PageLine::read(&format!("here {page}")), Some(PageLine::Here(page)));
+            assert_eq!(PageLine::read(&format!("left {page}")), Some(PageLine::Left(page)));
         }
         for line in
             ["", "here", "here x", "seen 1", "7 stop", "7 page stop", "7 page 1", "x page 1 stop", "7 page 1 @x stop"]
         {
-            assert_eq!(Line::read(line), None, "{line}");
+            assert_eq!(PageLine::read(line), None, "{line}");
         }
         for line in ["", "- -", "- - - -", "1 - -", "1.x - -", "- - 70000.1"] {
             assert_eq!(Seats::of(line), None, "{line}");

@@ -10,6 +10,7 @@
 
 use super::control::{Control, CycleInputs, Reading, Source};
 use super::counts::Counts;
+use super::line::Mark;
 use super::live::{Judge, Objection};
 use super::operator::{self, Answer, Commands, Reason};
 pub use super::operator::{Attention, Command, Operator, Watched};
@@ -475,7 +476,7 @@ impl Hil {
     }
 
     /// Writes words into the log; false if there is none yet.
-    fn mark(&mut self, mark: &operator::Mark) -> bool {
+    fn mark(&mut self, mark: &Mark) -> bool {
         let Some(log) = &mut self.log else { return false };
         self.words.clear();
         trace::write_mark(self.due_ns, mark.bytes(), &mut self.words);

@@ -6,6 +6,7 @@
 //! start. Judging allocates nothing, so that the cycle itself can do it, with the model's values at that moment: of
 //! several waiting sets, none is judged by values that another one changes later.
 
+use super::line::{Assignment, distance};
 use crate::safety::{Protection, is_present};
 use abi::description::Guard;
 use abi::format::{quantity, three_digits};
@@ -176,16 +177,14 @@ impl Judge {
         }
     }
 
-    /// Parses `fr.Fs = 2 N, fr.Fc = 1.5 N` into one set.
+    /// Makes one set of `fr.Fs = 2 N, fr.Fc = 1.5 N`.
     ///
     /// # Errors
     /// A message, with the error code of a start where there is one.
-    pub fn read(&self, text: &str) -> Result<Set, String> {
+    pub fn read(&self, all: &[Assignment]) -> Result<Set, String> {
         let mut values: Vec<(Slot, f64)> = Vec::new();
-        for one in text.split(',') {
-            let (path, value) =
-                one.split_once('=').ok_or("write it as `set PATH = VALUE`, for example `set fr.Fs = 2 N`")?;
-            let (path, value) = (path.trim(), value.trim());
+        for Assignment { path, value } in all {
+            let (path, value) = (path.as_str(), value.as_str());
             let Some(param) = self.live.param(path) else { return Err(self.unknown(path)) };
             let slot = match &param.place {
                 Tunable::Live(slot, _) => *slot,
@@ -253,21 +252,6 @@ fn in_unit(path: &str, unit: &Unit, text: &str) -> Result<f64, String> {
     })
 }
 
-/// Levenshtein distance of two names: insertions, deletions and substitutions of a character.
-fn distance(a: &str, b: &str) -> usize {
-    let b: Vec<char> = b.chars().collect();
-    let mut row: Vec<usize> = (0..=b.len()).collect();
-    for (i, x) in a.chars().enumerate() {
-        let mut corner = std::mem::replace(&mut row[0], i + 1);
-        for (j, y) in b.iter().enumerate() {
-            let changed = corner + usize::from(x != *y);
-            corner = row[j + 1];
-            row[j + 1] = changed.min(corner + 1).min(row[j] + 1);
-        }
-    }
-    row[b.len()]
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -296,7 +280,7 @@ mod tests {
             let live = Live { tuned: tuned.clone(), ..(*judge.live).clone() };
             let judge = Judge { live: Arc::new(live), ..judge.clone() };
             let (path, unit) = [("T", "N·m"), ("d", "N·m·s/rad"), ("end", "s")][at];
-            let found = judge.read(&format!("{path} = {value} {unit}"));
+            let found = judge.read(&[Assignment { path: path.into(), value: format!("{value} {unit}") }]);
             let own = tuned.iter().find(|tuned| tuned.param == at);
             let allowed = tuned.is_empty() || own.is_some_and(|own| (own.range.0..=own.range.1).contains(&value));
             match &found {

@@ -8,6 +8,7 @@ pub mod standard;
 pub mod watches;
 pub mod followed;
 pub mod control;
+pub mod line;
 pub mod live;
 pub mod origin;
 pub mod chair;

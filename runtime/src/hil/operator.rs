@@ -5,6 +5,7 @@
 //! refused at once if the queue is full, and by the cycle if it is older than [`OLD_NS`]. The cycle's side neither
 //! blocks nor allocates, because no more commands can be open than there are places for answers.
 
+use super::line::Mark;
 use super::live::{Objection, Set};
 use super::origin::Origin;
 use super::stage::Stage;
@@ -21,10 +22,6 @@ pub const PLACES: usize = 64;
 /// Age from which a command is refused, ns, because the operator may have changed his mind. At least two periods, so
 /// that a slow rig can be commanded at all.
 pub const OLD_NS: u64 = 1_000_000_000;
-
-/// Reason why `reset` is always refused.
-pub const NO_RESET: &str = "a stop is final: the rig ends as soon as its drives are at rest. Start it again, so that drives \
-                            are identified and tested anew";
 
 /// Polling interval of a thread that waits for an answer.
 const LOOK: Duration = Duration::from_millis(2);
@@ -43,40 +40,6 @@ pub enum Command {
     Set(Set),
     /// Words for the log, at this cycle.
     Mark(Mark),
-}
-
-/// Most bytes of a mark.
-pub const MARK_MOST: usize = 96;
-
-/// Words of an operator for the log.
-#[derive(Clone, Copy, PartialEq, Eq, Debug)]
-pub struct Mark {
-    bytes: [u8; MARK_MOST],
-    len: usize,
-}
-
-impl Mark {
-    /// A mark of these words.
-    ///
-    /// # Errors
-    /// Why they are none.
-    pub fn new(words: &str) -> Result<Mark, String> {
-        let words = words.trim();
-        if words.is_empty() {
-            return Err("a mark has words: `mark second bearing`".into());
-        }
-        if words.len() > MARK_MOST || words.chars().any(char::is_control) {
-            return Err(format!("a mark is a line of at most {MARK_MOST} bytes, and this one has {}", words.len()));
-        }
-        let mut bytes = [0; MARK_MOST];
-        bytes[..words.len()].copy_from_slice(words.as_bytes());
-        Ok(Mark { bytes, len: words.len() })
-    }
-
-    /// Its bytes.
-    pub fn bytes(&self) -> &[u8] {
-        &self.bytes[..self.len]
-    }
 }
 
 impl Command {
