@@ -212,6 +212,11 @@ fn a_rig_is_armed_set_and_stopped_from_the_page() {
     let [.., width, height] = page.place("#stop");
     assert!(width >= 150.0 && height >= 60.0, "{width} x {height}");
     page.shot("rig-small-dark");
+    // How much of the energy of its contact came back, and whether commands look ahead.
+    page.wait("!document.getElementById('energy').hidden");
+    let energy = "document.getElementById('energy').textContent";
+    assert!(page.text(energy).ends_with("commands look ahead where the rig says so"), "{}", page.text(energy));
+    assert_eq!(page.text("document.getElementById('energy').className"), "");
     // Esc stops, also in a field, from any viewer.
     let other = browser().page(&rig.link);
     sentence(&other, "armed");
@@ -227,6 +232,11 @@ fn a_rig_is_armed_set_and_stopped_from_the_page() {
     assert!(log.contains(&format!("set fr.Fs = 0.45 N·m in cycle {cycle}, at")), "{cycle}: {log}");
     let told = rig.told();
     assert!(told.contains("panel, page 1: set fr.Fs = 0.45 N·m, fr.Fc = 0.29 N·m"), "{told}");
+    // The share is that which the end of the run counts.
+    let share = |text: &str| text.split("at most ").nth(1)?.split(' ').next()?.parse::<f64>().ok();
+    let counted = told.lines().find(|line| line.contains("of the stored energy came back")).and_then(share);
+    let (shown, counted) = (share(&page.text(energy)).expect("a share"), counted.expect("a share"));
+    assert!(counted > 0.0 && (shown - counted).abs() < 0.02, "{shown} {counted}");
 }
 
 #[test]
@@ -534,8 +544,10 @@ fn one_page_operates_and_others_watch() {
     chair(&one, "you operate");
     chair(&two, "operates");
     chair(&guest, "you look on");
-    set(&two, &own("2.25"));
-    two.wait("[...document.querySelectorAll('.knob .refused')].some(r => /operates this rig: take over/.test(r.textContent))");
+    two.again(
+        &|| set(&two, &own("2.25")),
+        "[...document.querySelectorAll('.knob .refused')].some(r => /operates this rig: take over/.test(r.textContent))",
+    );
     assert!(two.value("document.getElementById('apply').disabled").as_bool().unwrap());
     one.shot("rig-operates");
     // Asked, refused; asked again, given.
