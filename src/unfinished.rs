@@ -174,6 +174,9 @@ impl Drop for Unfinished {
         if !self.begun {
             let _ = fs::remove_file(&self.path);
         }
+        // A process that was forked meanwhile, such as one of a pool, has the same open file: closing ours would leave it
+        // locked.
+        let _ = self.file.unlock();
     }
 }
 
