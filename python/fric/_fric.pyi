@@ -1,4 +1,4 @@
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from os import PathLike
 from typing import Any, final
 
@@ -29,7 +29,7 @@ __version__: str
 
 _Files = list[tuple[str, str, str, str]]
 
-def arrow_stream(columns: list[tuple[str, npt.NDArray[np.float64]]]) -> Any: ...
+def arrow_stream(columns: Sequence[tuple[str, Any]]) -> Any: ...
 def command(arguments: list[str]) -> int: ...
 def curve_svg(
     title: str, x: tuple[str, str], y: tuple[str, str], points: list[tuple[float, float]], wide: float, id: str

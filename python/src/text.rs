@@ -345,7 +345,8 @@ impl Run {
     }
 }
 
-/// A capsule with columns of doubles for readers of the Arrow C stream interface. `columns`: names and arrays.
+/// A capsule with columns for readers of the Arrow C stream interface. `columns`: names with arrays of numbers, or with
+/// lists of truth values or words.
 #[pyfunction]
 pub fn arrow_stream<'py>(
     py: Python<'py>,
