@@ -421,8 +421,8 @@ pub struct Test {
 }
 
 /// Options that a plan contains.
-const PLANNED: [&str; 12] =
-    ["keep", "vary", "best", "runs", "seed", "all", "solver", "step", "tol", "duration", "shard", "resume"];
+const PLANNED: [&str; 13] =
+    ["design", "keep", "vary", "best", "runs", "seed", "all", "solver", "step", "tol", "duration", "shard", "resume"];
 /// Options of a sweep that runs.
 const RUNNING: [&str; 9] = ["out", "resume", "shard", "threads", "plot", "no_error", "interpret", "unit", "join"];
 
@@ -476,6 +476,9 @@ pub struct Sweep {
     /// 0.2)', also normal, uniform, '~ ±20 %'
     #[arg(long, value_name = "CHANGE", value_parser = vary::parse)]
     pub vary: Vec<Vary>,
+    /// Runs of your own: a table .csv with a column for each quantity, such as `fr.Fs [N]`, and a row for each combination
+    #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
+    pub design: Option<PathBuf>,
     /// Print the K best rows: '5 by rms(e)', '3 by greatest period(x)'; of distributions by the mean, or '5 by p95 rms(e)'
     #[arg(long, value_name = "K by MEASURE", num_args = 1..=5)]
     pub best: Vec<String>,
@@ -495,6 +498,9 @@ pub struct Sweep {
     /// Continue an unfinished table
     #[arg(long)]
     pub resume: bool,
+    /// Run it on a cluster of Dask, dask://host:8786; for the command of the Python package
+    #[arg(long, value_name = "ADDRESS")]
+    pub on: Option<String>,
     /// Compute one of N parts; the tables of all parts in order are that of the whole
     #[arg(long, value_name = "I/N", value_parser = shard)]
     pub shard: Option<(u64, u64)>,

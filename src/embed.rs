@@ -6,8 +6,8 @@
 pub use crate::args::Keep;
 use crate::characterise::subject::Written;
 use crate::characterise::{Extent, page, study};
-use crate::commands::sweep::{self, SweepFault, SweepRequest};
-pub use crate::commands::sweep::{Rows as SweepRows, Sent as Sweep};
+use crate::commands::sweep::{self, SweepRequest};
+pub use crate::commands::sweep::{Rows as SweepRows, Sent as Sweep, SweepFault};
 use crate::commands::{characterise, explain, linearise};
 use crate::compile::{self, Built, Case, Changes, Idle, Loaded, Options, Stages};
 pub use crate::compile::{Dialect, Ports};
@@ -266,7 +266,7 @@ impl Text {
     }
 
     /// The plan of a sweep of an experiment, as bytes that [`Sweep`] reads, here and elsewhere. `vary`: as for `--vary`;
-    /// `runs`, `seed` and `keep` likewise.
+    /// `design`: as the file of `--design`; `runs`, `seed` and `keep` likewise.
     ///
     /// # Errors
     /// The errors of the experiment and of what varies.
@@ -274,6 +274,7 @@ impl Text {
         &self,
         experiment: &str,
         vary: &[String],
+        design: Option<String>,
         changes: &Changes,
         (runs, seed): (Option<u64>, Option<u64>),
         keep: Keep,
@@ -285,6 +286,7 @@ impl Text {
         let request = SweepRequest {
             experiment: experiment.into(),
             vary: vary.collect::<Result<_, _>>().map_err(wrong)?,
+            design,
             set,
             method,
             step,
@@ -297,6 +299,7 @@ impl Text {
         };
         let (method, bytes) = sweep::planned(request, &mut loaded, &self.sources).map_err(|fault| match fault {
             SweepFault::Misused(why) | SweepFault::Failed(why) => wrong(why),
+            SweepFault::Version(why) => wrong(why.to_string()),
             SweepFault::Text(_, found) => Problems::of(&loaded, &found),
         })?;
         match without_effect(experiment, method, changes) {

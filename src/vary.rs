@@ -1,4 +1,4 @@
-//! Parses `--vary`: a grid of values, or a distribution.
+//! Parses `--vary`: a grid of values, or a distribution; and the table of `--design`.
 //!
 //! In: text such as `fr.Fs = 1 N .. 2 N by 0.1 N` or `fr.vs ~ lognormal(1 mm/s, 0.2)`. Out: the value for each run, as
 //! a function of its number alone. Random numbers come from a counter-based generator, so a run has the same ones on
@@ -29,6 +29,8 @@ pub struct Vary {
 pub enum How {
     /// A list of values.
     Values(Vec<f64>),
+    /// A column of a design: the columns change together, row by row.
+    Design(Vec<f64>),
     /// Normal distribution: mean and standard deviation.
     Normal(f64, f64),
     /// Log-normal distribution: median, and standard deviation of the logarithm.
@@ -201,6 +203,62 @@ fn of_one_kind(texts: &[&str]) -> Result<(Vec<f64>, Unit), String> {
     Ok((read.iter().map(|(value, _)| *value).collect(), unit))
 }
 
+/// Reads a design: a line of headings such as `fr.Fs [N]`, and a line for each combination of values.
+///
+/// # Errors
+/// What is wrong, with the line and the column.
+pub fn design(text: &str) -> Result<Vec<Vary>, String> {
+    const EXAMPLE: &str =
+        "the first line names the columns, `fr.Fs [N],m [kg]`, each further line has a value for each";
+    let mut reader = csv::ReaderBuilder::new().has_headers(false).trim(csv::Trim::All).from_reader(text.as_bytes());
+    let mut columns: Vec<Vary> = Vec::new();
+    let mut values: Vec<Vec<f64>> = Vec::new();
+    for record in reader.records() {
+        let record = record.map_err(|error| format!("{error}: {EXAMPLE}"))?;
+        let line = record.position().map_or(0, csv::Position::line);
+        if columns.is_empty() {
+            for heading in &record {
+                let (path, unit) = match heading.split_once('[') {
+                    Some((path, unit)) => {
+                        let unit = unit.strip_suffix(']').ok_or(format!("line {line}: `{heading}` has no `]`"))?.trim();
+                        let known = Unit::parse(unit)
+                            .map_err(|_| format!("line {line}: `{unit}` in `{heading}` is no unit"))?;
+                        (path.trim(), known)
+                    }
+                    None => (heading, Unit::none()),
+                };
+                if path.is_empty() || path.parse::<f64>().is_ok() {
+                    return Err(format!("line {line}: `{heading}` is no name of a column: {EXAMPLE}"));
+                }
+                let how = How::Design(Vec::new());
+                columns.push(Vary { text: heading.into(), path: path.into(), unit, how });
+                values.push(Vec::new());
+            }
+            continue;
+        }
+        for ((cell, column), values) in record.iter().zip(&columns).zip(&mut values) {
+            let number = cell.parse::<f64>().ok().filter(|number| !number.is_nan());
+            let number = number.ok_or(format!("line {line}: `{cell}` in the column `{}` is no number", column.text))?;
+            values.push(quantity::si(number, &column.unit));
+        }
+    }
+    match values.first().map_or(0, Vec::len) {
+        0 => Err(format!("it has no rows: {EXAMPLE}")),
+        rows if rows > MOST_VALUES => Err(format!("{rows} rows are too many; {MOST_VALUES} are possible")),
+        _ => {
+            columns.iter_mut().zip(values).for_each(|(column, values)| column.how = How::Design(values));
+            Ok(columns)
+        }
+    }
+}
+
+/// Number of combinations of all grids and of the design.
+pub fn combinations(all: &[Vary]) -> u64 {
+    let design = all.iter().find(|vary| matches!(vary.how, How::Design(_))).and_then(Vary::len);
+    let grids = all.iter().filter(|vary| !matches!(vary.how, How::Design(_))).filter_map(Vary::len);
+    design.into_iter().chain(grids).map(|len| len as u64).product()
+}
+
 impl Vary {
     /// Its path, or those that take the same values together.
     pub fn paths(&self) -> impl Iterator<Item = &str> {
@@ -210,7 +268,7 @@ impl Vary {
     /// Number of values of a grid; none for a distribution.
     pub fn len(&self) -> Option<usize> {
         match &self.how {
-            How::Values(values) => Some(values.len()),
+            How::Values(values) | How::Design(values) => Some(values.len()),
             How::Around(_, count) => *count,
             How::Normal(..) | How::Lognormal(..) | How::Uniform(..) | How::Models(_) => None,
         }
@@ -234,7 +292,7 @@ impl Vary {
     /// A typical value, to check whether the text compiles with it.
     pub fn typical(&self) -> f64 {
         match &self.how {
-            How::Values(values) => values[values.len() / 2],
+            How::Values(values) | How::Design(values) => values[values.len() / 2],
             How::Normal(mean, _) => *mean,
             How::Lognormal(median, _) => *median,
             How::Uniform(low, high) => 0.5 * (low + high),
@@ -265,7 +323,7 @@ impl Dice {
             How::Normal(mean, deviation) => mean + deviation * self.normal(uniform),
             How::Lognormal(median, spread) => median * self.exp.at(spread * self.normal(uniform)),
             How::Uniform(low, high) => low + (high - low) * uniform,
-            How::Values(ref values) => values[(uniform * values.len() as f64) as usize],
+            How::Values(ref values) | How::Design(ref values) => values[(uniform * values.len() as f64) as usize],
             How::Around(..) | How::Models(_) => unreachable!("it is a grid or a distribution by now"),
         }
     }
@@ -410,6 +468,29 @@ mod tests {
         assert!(told("m = ±1 kg").contains("no share"));
         assert!(told("m, m = 1 kg, 2 kg").contains("twice"));
         assert!(told("m ~ ±5 % lin 3").contains("follow `=`"));
+    }
+
+    #[test]
+    fn a_design_is_read_in_its_units_and_mistakes_have_a_line() {
+        let read = design("fr.Fs [N], m [g],k\n1,200,3\n 2.5 ,1e3,-4\n").unwrap();
+        let columns: Vec<(&str, &How)> = read.iter().map(|vary| (vary.path.as_str(), &vary.how)).collect();
+        let of = |values: &[f64]| How::Design(values.to_vec());
+        assert_eq!(columns, [("fr.Fs", &of(&[1.0, 2.5])), ("m", &of(&[0.2, 1.0])), ("k", &of(&[3.0, -4.0]))]);
+        assert_eq!(combinations(&[read, vec![parse("x = 1 N, 2 N, 3 N").unwrap()]].concat()), 6);
+        for (text, words) in [
+            ("", "no rows"),
+            ("m [kg]\n", "no rows"),
+            ("1,2\n3,4\n", "line 1: `1` is no name of a column"),
+            ("m [kg\n1\n", "line 1: `m [kg` has no `]`"),
+            ("m [kgg]\n1\n", "line 1: `kgg` in `m [kgg]` is no unit"),
+            ("m [kg],k\n1,2\n3\n", "line: 3"),
+            ("m [kg],k\n1,2\n3,x\n", "line 3: `x` in the column `k` is no number"),
+            ("m [kg],k\n1,2\n3,\n", "line 3: `` in the column `k` is no number"),
+            ("m [kg]\nnan\n", "is no number"),
+        ] {
+            let why = design(text).unwrap_err();
+            assert!(why.contains(words), "{text:?}: {why}");
+        }
     }
 
     #[test]

@@ -8,7 +8,8 @@
 
 from fric._fric import Batch, Native, Stepper, __version__
 from fric._model import Explanation, Linear, Model, Quantity, Run, Study, Text, Verdict, load, loads, model
-from fric._sweep import Table, lognormal, normal, sweep, uniform
+from fric._statistics import Group, Measured, Statistics
+from fric._sweep import Table, lognormal, normal, sweep, sweep_rows, uniform
 from fric.errors import (
     CompileError,
     Diagnostic,
@@ -18,6 +19,7 @@ from fric.errors import (
     SweepError,
     UnitError,
     UnknownName,
+    VersionMismatch,
 )
 
 __all__ = [
@@ -25,14 +27,17 @@ __all__ = [
     "CompileError",
     "Diagnostic",
     "Explanation",
+    "Group",
     "InternalError",
     "Linear",
+    "Measured",
     "Model",
     "Native",
     "Quantity",
     "RangeError",
     "Run",
     "RunError",
+    "Statistics",
     "Stepper",
     "Study",
     "SweepError",
@@ -41,6 +46,7 @@ __all__ = [
     "UnitError",
     "UnknownName",
     "Verdict",
+    "VersionMismatch",
     "__version__",
     "load",
     "loads",
@@ -48,5 +54,6 @@ __all__ = [
     "model",
     "normal",
     "sweep",
+    "sweep_rows",
     "uniform",
 ]

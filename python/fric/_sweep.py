@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import csv
+import functools
 import hashlib
 import heapq
 import os
+import io
 import queue
+import socket
 import statistics
 import tempfile
 import time
 from collections import deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from concurrent import futures
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,7 +24,8 @@ import numpy as np
 
 from fric import _fric, _values
 from fric._model import Progress, Text, _reporter, load
-from fric.errors import SweepError, unknown
+from fric._statistics import Statistics
+from fric.errors import SweepError, VersionMismatch, unknown
 
 #: Most rows of a table in memory.
 MOST_ROWS = 1_000_000
@@ -75,6 +79,8 @@ class Table:
         self._kinds = dict(columns)
         self._rows = rows
         self._values: dict[str, np.ndarray] | None = None
+        #: What became of each measure, with ``keep="both"``.
+        self.statistics: Statistics | None = None
 
     @property
     def columns(self) -> list[str]:
@@ -115,6 +121,15 @@ class Table:
             return pandas.read_parquet(self.path)
         return pandas.DataFrame({title: self[title] for title in self._kinds})
 
+    def __arrow_c_stream__(self, requested_schema: object = None) -> Any:
+        """The columns for pyarrow, polars and DuckDB, numbers without a copy. A number that is missing is NaN."""
+        columns: list[tuple[str, Any]] = []
+        for title in self._kinds:
+            values = self[title]
+            numbers = values.dtype.kind in "if"
+            columns.append((title, np.ascontiguousarray(values) if numbers else values.tolist()))
+        return _fric.arrow_stream(columns)
+
     def __repr__(self) -> str:
         return f"<fric.Table {self._rows} runs: {', '.join(self._kinds)}>"
 
@@ -136,6 +151,7 @@ def sweep(
     experiment: str | None = None,
     *,
     vary: Mapping[str, Any] | Iterable[str] = (),
+    design: Any = None,
     runs: int | None = None,
     seed: int | None = None,
     set: Mapping[str, Any] | None = None,
@@ -144,22 +160,62 @@ def sweep(
     tol: float | None = None,
     duration: str | float | None = None,
     out: str | os.PathLike[str] | None = None,
+    keep: str = "rows",
+    shared: bool = False,
     on: Any = None,
     unit: float = 5.0,
     threads: int | None = None,
     resume: bool = False,
     progress: bool | Progress | None = None,
     retries: int = 3,
-) -> Table:
+) -> Table | Statistics:
     """Runs an experiment many times, with the rows and bytes of ``fric sweep``.
 
     ``vary``: what changes, as texts of ``--vary``, or by path: a text (``"1 N .. 2 N by 0.1 N"``), an array in SI, or a
-    distribution (:func:`normal`, :func:`lognormal`, :func:`uniform`), drawn ``runs`` times. ``out``: a name that ends in
-    ``.csv`` or ``.parquet``, or a folder for a dataset of Parquet files; else the table is in memory. ``on``: where it is
-    run: a client or cluster of Dask, its address ``"dask://host:8786"``, or any executor with ``submit``; else
-    ``threads`` threads here. ``unit``: about how many seconds of work are sent at once. ``resume``: goes on with a table
+    distribution (:func:`normal`, :func:`lognormal`, :func:`uniform`), drawn ``runs`` times. ``design``: runs of your
+    own, a DataFrame or a mapping from paths, such as ``"m"`` in SI or ``"m [g]"``, to columns of one length. ``out``: a name that ends in
+    ``.csv`` or ``.parquet``, or a folder for a dataset of Parquet files; else the table is in memory. ``keep``: ``"rows"``;
+    ``"summary"``, statistics alone, in memory or as ``.json``; or ``"both"``, a table with statistics. ``on``: where it is run: a client or cluster of Dask, its address ``"dask://host:8786"``, or any executor with ``submit``; else
+    ``threads`` threads here. ``shared``: the workers write the files of a dataset, into a folder that all machines see under
+    one name; only their hashes are sent. ``unit``: about how many seconds of work are sent at once. ``resume``: goes on with a table
     that was interrupted, here or elsewhere. A unit whose worker dies is sent again, up to ``retries`` times.
     """
+    plan = _plan(text, experiment, vary, design, runs, seed, set, solver, step, tol, duration, keep)
+    if out is not None:
+        _check_name(Path(out), keep)
+        if shared and (keep == "summary" or Path(out).suffix):
+            raise ValueError("shared: workers write the files of a dataset: out= is then a folder, a name without ending")
+        return _run(plan, Path(out), keep, on, unit, threads, resume, progress, retries, shared=shared)
+    if shared:
+        raise ValueError("shared: workers write the files of a dataset: name its folder with out=")
+    if resume:
+        raise ValueError("resume: a table in memory is gone when a call ends; name a file with out=")
+    with tempfile.TemporaryDirectory(prefix="fric-") as folder:
+        name = "table.json" if keep == "summary" else "table.csv"
+        most = None if keep == "summary" else MOST_ROWS
+        table = _run(plan, Path(folder) / name, keep, on, unit, threads, False, progress, retries, most)
+        if isinstance(table, Table):
+            table._values = table._read(table.path)
+            if table.statistics is not None:
+                table.statistics.path = None
+        table.path = None
+    return table
+
+
+def _plan(
+    text: str | os.PathLike[str] | Text,
+    experiment: str | None,
+    vary: Mapping[str, Any] | Iterable[str],
+    design: Any,
+    runs: int | None,
+    seed: int | None,
+    set: Mapping[str, Any] | None,
+    solver: str | None,
+    step: str | float | None,
+    tol: float | None,
+    duration: str | float | None,
+    keep: str,
+) -> bytes:
     loaded = text if isinstance(text, Text) else load(text)
     if experiment is None:
         if len(loaded.experiments) != 1:
@@ -168,10 +224,11 @@ def sweep(
     elif experiment not in loaded.experiments:
         raise unknown("experiment", experiment, loaded.experiments)
     known = {path: (si, False) for path, si in loaded._inner.units(experiment)}
-    plan = _fric.sweep_plan(
+    return _fric.sweep_plan(
         loaded._inner,
         experiment,
         _varied(vary, known),
+        None if design is None else _table(design, known),
         [f"{path}={value}" for path, value in _values.settings(dict(set or {}), known).items()],
         solver,
         None if step is None else _values.seconds("step", step),
@@ -179,16 +236,109 @@ def sweep(
         None if duration is None else _values.seconds("duration", duration),
         runs,
         seed,
+        keep,
     )
-    if out is not None:
-        return _run(plan, Path(out), on, unit, threads, resume, progress, retries)
-    if resume:
-        raise ValueError("resume: a table in memory is gone when a call ends; name a file with out=")
-    with tempfile.TemporaryDirectory(prefix="fric-") as folder:
-        table = _run(plan, Path(folder) / "table.csv", on, unit, threads, False, progress, retries, MOST_ROWS)
-        table._values = table._read(table.path)
-        table.path = None
-    return table
+
+
+def _table(design: Any, known: Mapping[str, tuple[str, bool]]) -> str:
+    """A design as the text of a table."""
+    if isinstance(design, (str, os.PathLike)):
+        return Path(design).read_text(encoding="utf-8")
+    if hasattr(design, "columns") and hasattr(design, "to_numpy"):
+        design = {title: design[title].to_numpy() for title in design.columns}
+    if not isinstance(design, Mapping):
+        raise TypeError(
+            f"design: a DataFrame, the name of a file .csv, or a mapping from paths to values is needed, not "
+            f"{type(design).__name__}; of an array: dict(zip(paths, array.T))"
+        )
+    columns = {str(title): np.asarray(values, dtype=float) for title, values in design.items()}
+    lengths = {title: values.shape for title, values in columns.items()}
+    if not columns or any(len(shape) != 1 for shape in lengths.values()) or len(dict.fromkeys(lengths.values())) != 1:
+        raise ValueError(f"design: columns of one length are needed, not {lengths}")
+    # A path alone is in SI.
+    units = {title: known.get(title.strip(), ("", False))[0] for title in columns}
+    heads = [f"{title} [{units[title]}]" if units[title] and "[" not in title else title for title in columns]
+    text = io.StringIO()
+    lines = csv.writer(text, lineterminator="\n")
+    lines.writerow(heads)
+    lines.writerows(map(repr, row) for row in zip(*(values.tolist() for values in columns.values())))
+    return text.getvalue()
+
+
+def sweep_rows(
+    text: str | os.PathLike[str] | Text,
+    experiment: str | None = None,
+    *,
+    vary: Mapping[str, Any] | Iterable[str] = (),
+    design: Any = None,
+    runs: int | None = None,
+    seed: int | None = None,
+    set: Mapping[str, Any] | None = None,
+    solver: str | None = None,
+    step: str | float | None = None,
+    tol: float | None = None,
+    duration: str | float | None = None,
+    on: Any = None,
+    unit: float = 5.0,
+    threads: int | None = None,
+    retries: int = 3,
+) -> Iterator[tuple[int, Table]]:
+    """The rows of a sweep as they come, in the order of the runs: the number of the first run, and a table of some rows.
+
+    Arguments are those of :func:`sweep`. Nothing is written, and memory does not grow with the number of runs. An iterator
+    that is closed, or left by ``break`` and no longer used, stops what is under way.
+    """
+    plan = _plan(text, experiment, vary, design, runs, seed, set, solver, step, tol, duration, "rows")
+    return _streamed(plan, on, unit, threads, retries)
+
+
+def _streamed(plan: bytes, on: Any, unit: float, threads: int | None, retries: int) -> Iterator[tuple[int, Table]]:
+    engine = _engine(on, threads)
+    sent: dict[Any, tuple[int, int, int]] = {}
+    rows = _Rows(plan)
+    try:
+        client = _Client(plan, None, rows, engine, _seconds(unit, engine), retries, sent)
+        for _ in client.steps():
+            yield from rows.come()
+        yield from rows.come()
+        client.end()
+    finally:
+        engine.close(sent)
+
+
+class _Rows:
+    """Rows that are handed on and not kept."""
+
+    def __init__(self, plan: bytes):
+        self.total, self.columns = _fric.sweep_about(plan)
+        self.items, self.next = self.total, 0
+        self._come: list[tuple[int, Table]] = []
+
+    def runs(self, items: int) -> int:
+        return items
+
+    def take(self, unit: bytes) -> None:
+        # Between the first line and the last, which name the plan and the hash.
+        lines = unit.decode("utf-8").splitlines()[1:-1]
+        first = int(lines[0].split(",", 1)[0])
+        assert first <= self.next
+        cells = list(csv.reader(lines[self.next - first :]))
+        columns = list(zip(*cells)) or [()] * len(self.columns)
+        table = Table(None, self.columns, len(cells), "")
+        table._values = {title: _column(kind, column) for (title, kind), column in zip(self.columns, columns)}
+        self._come.append((self.next, table))
+        self.next += len(cells)
+
+    def come(self) -> list[tuple[int, Table]]:
+        come, self._come = self._come, []
+        return come
+
+
+def _check_name(out: Path, keep: str) -> None:
+    if keep == "summary" and out.suffix != ".json":
+        raise ValueError(f"out: {out}: the name of statistics ends in .json")
+    if keep != "summary" and out.suffix not in ("", ".csv", ".parquet"):
+        raise ValueError(f"out: {out}: the name of a table ends in .csv or .parquet, that of a dataset has no ending")
 
 
 def _varied(vary: Mapping[str, Any] | Iterable[str], known: Mapping[str, tuple[str, bool]]) -> list[str]:
@@ -211,9 +361,28 @@ def _varied(vary: Mapping[str, Any] | Iterable[str], known: Mapping[str, tuple[s
 
 def _work(plan: bytes, first: int, last: int) -> tuple[bytes, float]:
     """A unit, and the seconds that it took. Sent to workers."""
+    return _worked(_fric.sweep_unit, plan, first, last)
+
+
+def _worked(work: Any, *arguments: Any) -> tuple[bytes, float]:
     begin = time.perf_counter()
-    rows = _fric.sweep_unit(plan, first, last)
-    return rows, time.perf_counter() - begin
+    try:
+        made = work(*arguments)
+    except VersionMismatch as error:
+        host, planned, installed = socket.gethostname(), error.planned, error.installed
+        remedy = f"pip install fric=={planned}" if planned != installed else "install the same build of fric"
+        raise VersionMismatch(
+            f"{host} has fric {installed}, and the sweep was planned by fric {planned}: on {host}, {remedy}",
+            planned,
+            installed,
+            host,
+        ) from None
+    return made, time.perf_counter() - begin
+
+
+def _work_shared(folder: str, plan: bytes, first: int, last: int) -> tuple[bytes, float]:
+    """A file of a dataset in a folder that the client sees too: its hash, and the seconds that it took. Sent to workers."""
+    return _worked(lambda: _fric.sweep_file(plan, folder, first).encode())
 
 
 class _Engine:
@@ -221,6 +390,8 @@ class _Engine:
 
     def __init__(self, executor: Any, slots: int | None = None):
         self._executor, self._slots = executor, slots
+        #: What workers do.
+        self.work: Any = _work
         self._done: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._polled: list[Any] = []
 
@@ -229,7 +400,7 @@ class _Engine:
         return self._slots or getattr(self._executor, "_max_workers", None) or os.cpu_count() or 1
 
     def _submit(self, plan: bytes, first: int, last: int) -> Any:
-        return self._executor.submit(_work, plan, first, last)
+        return self._executor.submit(self.work, plan, first, last)
 
     def send(self, plan: bytes, first: int, last: int) -> Any:
         future = self._submit(plan, first, last)
@@ -290,7 +461,7 @@ class _Dask(_Engine):
         self._sent += 1
         key = f"fric-{hashlib.sha256(plan).hexdigest()[:8]}-{first}-{last}-{self._sent}"
         # `pure`: equal arguments would be taken for an equal task, and an old result be handed out.
-        return self._client.submit(_work, plan, first, last, key=key, pure=False, retries=0)
+        return self._client.submit(self.work, plan, first, last, key=key, pure=False, retries=0)
 
     def lost(self) -> str | None:
         status = getattr(self._client, "status", "running")
@@ -329,12 +500,13 @@ def _engine(on: Any, threads: int | None) -> _Engine:
 def _is_death(error: BaseException) -> bool:
     """Whether a worker ended under a unit, so that another may finish it."""
     names = {kind.__name__ for kind in type(error).__mro__}
-    return bool(names & {"KilledWorker", "CancelledError", "FutureCancelledError", "WorkerCrashedError", "CommClosedError"})
+    return bool(names & {"KilledWorker", "CancelledError", "FutureCancelledError", "CommClosedError", "UncompletedJobError"})
 
 
 def _run(
     plan: bytes,
     out: Path,
+    keep: str,
     on: Any,
     unit: float,
     threads: int | None,
@@ -342,9 +514,8 @@ def _run(
     progress: bool | Progress | None,
     retries: int,
     most: int | None = None,
-) -> Table:
-    if not 0 < unit < float("inf"):
-        raise ValueError("unit: a positive number of seconds is needed")
+    shared: bool = False,
+) -> Table | Statistics:
     engine = _engine(on, threads)
     sent: dict[Any, tuple[int, int, int]] = {}
     rows = None
@@ -356,14 +527,30 @@ def _run(
             import warnings
 
             warnings.warn(warning, stacklevel=3)
-        # Here nothing is lost on the way: short units let Ctrl-C end the threads soon.
-        unit = min(unit, 0.5) if isinstance(engine, _Threads) else unit
-        _Client(plan, out, rows, engine, unit, retries, sent).run(_reporter(progress))
-        return Table(out, rows.columns, rows.total, rows.finish())
+        client = _Client(plan, out, rows, engine, _seconds(unit, engine), retries, sent)
+        if shared:
+            engine.work = functools.partial(_work_shared, str(out.resolve()))
+            client.share()
+        client.run(_reporter(progress))
+        words = rows.finish()
+        if keep == "summary":
+            return Statistics(out, words)
+        table = Table(out, rows.columns, rows.total, words)
+        if keep == "both":
+            table.statistics = Statistics(out.with_suffix(".json"))
+        return table
     finally:
         engine.close(sent)
         if rows is not None:
             rows.leave()
+
+
+def _seconds(unit: float, engine: _Engine) -> float:
+    """Seconds of a unit."""
+    if not 0 < unit < float("inf"):
+        raise ValueError("unit: a positive number of seconds is needed")
+    # Here nothing is lost on the way: short units let Ctrl-C end the threads soon.
+    return min(unit, 0.5) if isinstance(engine, _Threads) else unit
 
 
 class _Client:
@@ -372,7 +559,7 @@ class _Client:
     def __init__(
         self,
         plan: bytes,
-        out: Path,
+        out: Path | None,
         rows: Any,
         engine: _Engine,
         unit: float,
@@ -381,6 +568,13 @@ class _Client:
     ):
         self.plan, self.out, self.rows, self.engine, self.retries, self.sent = plan, out, rows, engine, retries, sent
         self.seconds = min(unit, LONGEST)
+        #: Runs of a block, of which only statistics are kept; else 1.
+        block = max(1, rows.total // max(1, rows.items))
+        self.fewest = max(1, FEWEST // block)
+        self.what = "row" if rows.items == rows.total else "block"
+        #: Runs of each unit, if they are files of a dataset; and where units go that come next.
+        self.each = 0
+        self.put: Any = rows.take
         #: Units that came before an earlier one, and their bytes.
         self.waiting: dict[int, tuple[int, bytes]] = {}
         #: Units to send again: first, last, deaths.
@@ -393,14 +587,21 @@ class _Client:
         self.begin = rows.next
         self.unsent = rows.next
 
+    def share(self) -> None:
+        """Lets workers write the files of a dataset: a unit is a file."""
+        self.each = self.rows.rows_a_file
+        self.put = lambda hash: self.rows.adopt(hash.decode())
+
     def size(self) -> int:
         """Runs of the next unit."""
+        if self.each:
+            return self.each
         if not self.costs:
-            return FEWEST
+            return self.fewest
         size = self.seconds / max(statistics.median(self.costs), 1e-9)
         # The last units are smaller, so that all workers end at about the same time.
-        left = (self.rows.total - self.unsent) / (2 * self.engine.slots())
-        return max(FEWEST, int(min(size, left)))
+        left = (self.rows.items - self.unsent) / (2 * self.engine.slots())
+        return max(self.fewest, int(min(size, left)))
 
     def send(self) -> None:
         """Sends what may be out: two units for each slot."""
@@ -416,24 +617,34 @@ class _Client:
                 if alone:
                     self.sent[self.engine.send(self.plan, first, last)] = first, last, deaths
                     return
-            elif self.unsent < self.rows.total and sum(len(one) for _, one in self.waiting.values()) < MOST_WAITING:
+            elif self.unsent < self.rows.items and sum(len(one) for _, one in self.waiting.values()) < MOST_WAITING:
                 # Without a known cost a few runs for each slot are enough.
                 if not self.costs and len(self.sent) >= self.engine.slots():
                     return
                 first, deaths = self.unsent, 0
-                last = self.unsent = min(self.rows.total, first + self.size())
+                last = self.unsent = min(self.rows.items, first + self.size())
             else:
                 return
             self.sent[self.engine.send(self.plan, first, last)] = first, last, deaths
 
+    def kept(self, why: str) -> SweepError:
+        """The error that ends a sweep, which can be resumed."""
+        next = self.rows.next
+        if self.out is None:
+            return SweepError(why, [(next, self.rows.total)])
+        return SweepError(
+            f"{why}; the {self.what}s before {self.what} {next} are kept: resume=True goes on with them",
+            [(self.rows.runs(next), self.rows.total)],
+        )
+
     def died(self, first: int, last: int, deaths: int) -> None:
         self.deaths += 1
         if self.deaths > MOST_DEATHS:
-            raise SweepError(
-                f"{MOST_DEATHS} workers died one after the other, and no row came between; the rows before run "
-                f"{self.rows.next} are kept: resume=True goes on with them",
-                [(self.rows.next, self.rows.total)],
-            )
+            raise self.kept(f"{MOST_DEATHS} workers died one after the other, and no row came between")
+        # A file of a dataset is not halved.
+        if self.each and deaths + 1 >= max(3, self.retries) + 2:
+            self.poison.append(first)
+            return
         # A run is named only after it has died alone several times: its neighbour may have gone down with it.
         if deaths + 1 < max(3, self.retries) + (2 if last - first == 1 else 0):
             heapq.heappush(self.again, (first, last, deaths + 1))
@@ -454,20 +665,25 @@ class _Client:
                 self.died(first, last, deaths)
                 return
             why = str(error) or type(error).__name__
-            raise SweepError(
-                f"runs {first} to {last - 1}: {why}; the rows before run {self.rows.next} are kept: resume=True goes on with them",
-                [(self.rows.next, self.rows.total)],
-            ) from error
+            if isinstance(error, VersionMismatch):
+                kept = self.kept(str(error))
+                raise VersionMismatch(str(kept), error.planned, error.installed, error.host, kept.missing) from error
+            raise self.kept(f"{self.what}s {first} to {last - 1}: {why}") from error
         self.costs.append(seconds / max(1, last - first))
         self.deaths = 0
         self.waiting[first] = last, unit
         while self.rows.next in self.waiting:
-            self.rows.take(self.waiting.pop(self.rows.next)[1])
+            try:
+                self.put(self.waiting.pop(self.rows.next)[1])
+            except ValueError as error:
+                raise self.kept(str(error)) from error
         if self.poison:
             self.spill()
 
     def spill(self) -> None:
         """Writes units that no row can precede as files for ``fric sweep --join``."""
+        if self.out is None or self.each:
+            return
         folder = self.out.with_name(f"{self.out.name}.units")
         folder.mkdir(exist_ok=True)
         (folder / "sweep.fricjob").write_bytes(self.plan)
@@ -479,7 +695,14 @@ class _Client:
                 self.waiting[first] = last, b""
 
     def run(self, report: Progress | None) -> None:
-        while self.rows.next < self.rows.total:
+        for _ in self.steps():
+            if report:
+                report(self.rows.runs(self.rows.next), self.rows.total)
+        self.end()
+
+    def steps(self) -> Iterator[None]:
+        """Works until no more units can come, and pauses after some have."""
+        while self.rows.next < self.rows.items:
             self.send()
             if not self.sent:
                 break
@@ -487,20 +710,30 @@ class _Client:
                 self.take(future)
             lost = self.engine.lost()
             if lost:
-                raise SweepError(
-                    f"{lost}; the rows before run {self.rows.next} are kept: resume=True goes on with them",
-                    [(self.rows.next, self.rows.total)],
-                )
-            if report:
-                report(self.rows.next, self.rows.total)
+                raise self.kept(lost)
+            yield
+
+    def end(self) -> None:
+        """Names the runs that end their workers."""
         if not self.poison:
             return
         self.poison.sort()
         self.spill()
-        folder = self.out.with_name(f"{self.out.name}.units")
         some = ", ".join(map(str, self.poison[:5])) + (" …" if len(self.poison) > 5 else "")
+        missing = [(self.rows.runs(one), self.rows.runs(one + 1)) for one in self.poison]
+        if self.each:
+            missing = [(first, min(first + self.each, self.rows.total)) for first in self.poison]
+            raise SweepError(
+                f"one of the {self.each} runs from {some} on ends the worker that makes it; all other files of {self.out} are there: "
+                f"the same sweep without shared= finds the run",
+                missing,
+            )
+        if self.out is None:
+            raise SweepError(f"run {some} ends the worker that makes it, also alone", missing)
+        folder = self.out.with_name(f"{self.out.name}.units")
         raise SweepError(
-            f"run {some} ends the worker that makes it, also alone; the rows before run {self.rows.next} are in {self.out}, all "
-            f"later ones in {folder}, for `fric sweep --join {folder / 'sweep.fricjob'}`",
-            [(run, run + 1) for run in self.poison],
+            f"{'run' if self.what == 'row' else 'block'} {some} ends the worker that makes it, also alone; the {self.what}s before "
+            f"{self.what} {self.rows.next} are kept for resume=True, all later ones are in {folder}, for `fric sweep --join "
+            f"{folder / 'sweep.fricjob'}`",
+            missing,
         )

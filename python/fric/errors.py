@@ -15,6 +15,7 @@ __all__ = [
     "SweepError",
     "UnitError",
     "UnknownName",
+    "VersionMismatch",
 ]
 
 
@@ -124,6 +125,24 @@ class SweepError(RuntimeError):
 
     def __reduce__(self) -> Any:
         return type(self), (str(self), self.missing)
+
+
+class VersionMismatch(SweepError):
+    """A worker has another version of fric than the plan of a sweep: ``host``, ``planned`` and ``installed``."""
+
+    def __init__(
+        self,
+        message: str,
+        planned: str = "",
+        installed: str = "",
+        host: str = "",
+        missing: list[tuple[int, int]] | None = None,
+    ):
+        super().__init__(message, missing or [])
+        self.planned, self.installed, self.host = planned, installed, host
+
+    def __reduce__(self) -> Any:
+        return type(self), (str(self), self.planned, self.installed, self.host, self.missing)
 
 
 class InternalError(RuntimeError):

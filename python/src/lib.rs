@@ -34,7 +34,7 @@ mod _fric {
     #[pymodule_export]
     use crate::stepper::Stepper;
     #[pymodule_export]
-    use crate::sweep::{SweepRows, sweep_plan, sweep_unit};
+    use crate::sweep::{SweepRows, sweep_about, sweep_file, sweep_plan, sweep_unit};
     #[pymodule_export]
     use crate::text::{Run, Text, arrow_stream};
     use abi::unit::Unit;

@@ -1,7 +1,8 @@
 //! Exceptions of `fric.errors`.
 
-use fric::embed::Problems;
+use fric::embed::{Problems, SweepFault};
 use pyo3::call::PyCallArgs;
+use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::sync::PyOnceLock;
 
@@ -21,6 +22,16 @@ fn errors<'py>(py: Python<'py>) -> PyResult<&'py Bound<'py, PyModule>> {
 pub fn problems(py: Python, found: &Problems) -> PyErr {
     let codes: Vec<&str> = found.codes.clone();
     of(py, "of_problems", (&found.report, &found.json, codes))
+}
+
+/// A plan that cannot be used.
+pub fn sweep_fault(py: Python, fault: &SweepFault) -> PyErr {
+    match fault {
+        SweepFault::Version(why) => {
+            of(py, "VersionMismatch", (fault.words(), why.written_by(), env!("CARGO_PKG_VERSION")))
+        }
+        SweepFault::Misused(_) | SweepFault::Failed(_) | SweepFault::Text(..) => PyValueError::new_err(fault.words()),
+    }
 }
 
 /// A run or a step that stopped. `rows`: what was computed before.

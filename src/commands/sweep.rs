@@ -10,6 +10,7 @@ mod errors;
 mod summary;
 mod sketch;
 mod statistics;
+mod version;
 mod request;
 mod plan;
 mod unit;
@@ -33,7 +34,7 @@ use crate::plot::{self, Axis};
 use crate::quantity::{self, count, significant};
 use crate::terminal::{Style, Terminal};
 use crate::unfinished::Hash;
-use crate::vary::{Dice, How, Vary};
+use crate::vary::{Dice, How, Vary, combinations};
 use crate::{project, results};
 use abi::plan::{Expect, Formula, Measure};
 use abi::unit::Unit;
@@ -68,8 +69,8 @@ pub fn sweep(args: &Sweep, terminal: &mut Terminal) -> End {
             terminal.error(&message);
             End::Misused
         }
-        Fault::Failed(message) => {
-            terminal.error(&message);
+        fault @ (Fault::Failed(_) | Fault::Version(_)) => {
+            terminal.error(&fault.words());
             End::Failed
         }
         Fault::Text(message, _) => {
@@ -109,6 +110,12 @@ fn table_name(args: &Sweep, keep: Keep) -> Result<PathBuf, Fault> {
 
 /// The sweep of a text: run, or written as a plan.
 fn of_text(args: &Sweep, terminal: &mut Terminal) -> Result<End, Fault> {
+    if let Some(address) = &args.on {
+        return Err(Fault::Misused(format!(
+            "--on {address} needs the Python package, whose `fric` sends units to Dask: pip install 'fric[dask]'; without \
+             Python see --plan and --unit"
+        )));
+    }
     let out = table_name(args, args.keep.unwrap_or_default())?;
     let sources = NamedFiles::default();
     let Some(mut loaded) = load_from(&args.file, &sources, terminal, &mut Stopwatch::start("read")) else {
@@ -121,7 +128,12 @@ fn of_text(args: &Sweep, terminal: &mut Terminal) -> Result<End, Fault> {
     };
     let name = name.to_string_lossy();
     has_experiment(&args.file, &name, &all).map_err(Fault::Failed)?;
-    let table = request::table(Request::of(args, &name), &mut loaded, &sources, terminal.error_colour())?;
+    let mut request = Request::of(args, &name);
+    if let Some(path) = &args.design {
+        let told = |error| Fault::Failed(format!("cannot read {}: {error}", path.display()));
+        request.design = Some(fs::read_to_string(path).map_err(told)?);
+    }
+    let table = request::table(request, &mut loaded, &sources, terminal.error_colour())?;
     let (stepped, tol) = (&args.changed.stepped, args.changed.tol);
     let method = table.cases[0].experiment.solver.method;
     if let Some(why) = stepped.without_effect_and(tol, &name, method) {
@@ -167,7 +179,7 @@ struct Planned {
 
 fn of_plan(args: &Sweep, terminal: &Terminal) -> Result<Planned, Fault> {
     let path = args.file.clone();
-    let told = |why: String| Fault::Failed(format!("{} {why}", path.display()));
+    let told = |why: version::Unusable| Fault::Failed(format!("{} {why}", path.display()));
     let bytes = fs::read(&path).map_err(|error| Fault::Failed(format!("cannot read {}: {error}", path.display())))?;
     let Plan { mut request, hash, text } = plan::read(&bytes).map_err(told)?;
     let (mut loaded, sources) = text.load();
@@ -430,7 +442,7 @@ impl SweepTable {
         let mut slots: Vec<Vec<Vec<(Slot, f64)>>> = cases.iter().map(|_| Vec::new()).collect();
         let vary: Vec<Vary> =
             vary.into_iter().map(|vary| placed(vary, &cases, &mut slots)).collect::<Result<_, String>>()?;
-        let grid = vary.iter().filter_map(Vary::len).map(|len| len as u64).product();
+        let grid = combinations(&vary);
         let random = vary.iter().any(|vary| vary.len().is_none());
         let draws = match (random, request.runs) {
             (true, runs) => runs.unwrap_or(DEFAULT_RUNS),
@@ -475,15 +487,24 @@ impl SweepTable {
         self.cases.len() as u64 * self.grid * self.draws
     }
 
-    /// The case of a run and its values in SI: the last grid varies fastest, with the draws inside it.
+    /// The case of a run and its values in SI: the design varies slowest and the last grid fastest, with the draws inside
+    /// it.
     fn values(&self, run: u64, dice: &Dice) -> (usize, Vec<f64>) {
         let (point, draw) = (run / self.draws, run % self.draws);
         let (case, mut left) = ((point / self.grid) as usize, point % self.grid);
         let mut values = vec![0.0; self.vary.len()];
         let mut stride = self.grid;
-        let mut k = 0;
+        let (mut k, mut row) = (0, None);
         for (vary, value) in self.vary.iter().zip(&mut values) {
             match &vary.how {
+                How::Design(all) => {
+                    if row.is_none() {
+                        stride /= all.len() as u64;
+                        row = Some(left / stride);
+                        left %= stride;
+                    }
+                    *value = all[row.unwrap_or(0) as usize];
+                }
                 How::Values(all) => {
                     stride /= all.len() as u64;
                     *value = all[(left / stride) as usize];
@@ -877,6 +898,10 @@ impl SweepTable {
         }
         for vary in &self.vary {
             let how = match &vary.how {
+                How::Design(values) => {
+                    let hash = values.iter().fold(Hash::EMPTY, |hash, value| hash.and(&value.to_bits().to_le_bytes()));
+                    format!("a design of {} rows, {hash:016x}", values.len())
+                }
                 How::Values(values) => {
                     format!("{} values, {:?} .. {:?}", values.len(), values[0], values[values.len() - 1])
                 }

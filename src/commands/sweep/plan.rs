@@ -4,6 +4,7 @@
 //! library goes by its hash. Reading a plan opens no other file.
 
 use super::request::Request;
+use super::version::Unusable;
 use crate::args::Keep;
 use crate::compile::{self, Loaded, Method};
 use crate::named_files::{NamedFile, NamedFiles};
@@ -45,6 +46,7 @@ pub fn bytes(request: &Request, name: &str, text: &str, files: &[NamedFile]) -> 
         "version": env!("CARGO_PKG_VERSION"),
         "library": library(),
         "experiment": request.experiment,
+        "design": request.design,
         "vary": request.vary.iter().map(|vary| &vary.text).collect::<Vec<_>>(),
         "set": request.set,
         "solver": request.method.map(Method::name),
@@ -67,25 +69,16 @@ pub fn bytes(request: &Request, name: &str, text: &str, files: &[NamedFile]) -> 
 /// Reads a plan.
 ///
 /// # Errors
-/// What is wrong with it, to follow its name: "… is no plan".
-pub fn read(bytes: &[u8]) -> Result<Plan, String> {
-    const NONE: &str = "is no whole plan of a sweep: `fric sweep FILE EXPERIMENT … --plan NAME` writes one";
-    let object: Value = serde_json::from_slice(bytes).map_err(|_| NONE)?;
+/// What is wrong with it.
+pub fn read(bytes: &[u8]) -> Result<Plan, Unusable> {
+    let object: Value = serde_json::from_slice(bytes).map_err(|_| Unusable::NotWhole)?;
     let told = |key: &str| object[key].as_str().unwrap_or("?").to_string();
-    let format = object["fric sweep"].as_u64().ok_or(NONE)?;
-    let here = env!("CARGO_PKG_VERSION");
-    if format != FORMAT || told("version") != here {
-        return Err(format!(
-            "was written by fric {} (plans of kind {format}), and this is fric {here} (kind {FORMAT}), whose rows may differ: \
-             install the same version everywhere, or write the plan again",
-            told("version")
-        ));
+    let format = object["fric sweep"].as_u64().ok_or(Unusable::NotWhole)?;
+    if format != FORMAT || told("version") != env!("CARGO_PKG_VERSION") {
+        return Err(Unusable::Version(told("version"), format, FORMAT));
     }
     if told("library") != library() {
-        return Err(format!(
-            "was written by a fric {here} with another library of models: install the same build everywhere, or write the \
-             plan again"
-        ));
+        return Err(Unusable::Library);
     }
     let text = |key: &str| object[key].as_str().map(str::to_string);
     let texts = |value: &Value| -> Option<Vec<String>> {
@@ -113,6 +106,10 @@ pub fn read(bytes: &[u8]) -> Result<Plan, String> {
             request: Request {
                 experiment: text("experiment")?,
                 vary: vary.iter().map(|text| vary::parse(text).ok()).collect::<Option<_>>()?,
+                design: match &object["design"] {
+                    Value::Null if object.get("design").is_some() => None,
+                    value => Some(value.as_str()?.to_string()),
+                },
                 set: texts(&object["set"])?,
                 method: method()?,
                 step: number("step")?,
@@ -128,7 +125,7 @@ pub fn read(bytes: &[u8]) -> Result<Plan, String> {
             hash: abi::image::sha256(bytes).iter().map(|byte| format!("{byte:02x}")).collect(),
         })
     };
-    plan().ok_or_else(|| NONE.into())
+    plan().ok_or(Unusable::NotWhole)
 }
 
 impl SentText {
@@ -155,6 +152,7 @@ mod tests {
             runs: Some(u64::MAX),
             best: vec!["5 by rms(x)".into()],
             keep: Keep::Summary,
+            design: Some("m [kg]\n1\n".into()),
             ..Request::default()
         };
         let files = [("a".to_string(), "b.csv".to_string(), "/c/b.csv".to_string(), "t;x\n\"é\n".to_string())];
@@ -166,16 +164,17 @@ mod tests {
         assert_eq!(bytes(&plan.request, name, text, found), written);
         for end in 0..written.len() - 1 {
             let why = read(&written[..end]).err().unwrap_or_else(|| panic!("cut to {end} bytes it was read"));
-            assert!(why.contains("no whole plan"), "{why}");
+            assert_eq!(why, Unusable::NotWhole);
+            assert!(why.to_string().contains("no whole plan"), "{why}");
         }
         let text = String::from_utf8(written).unwrap();
-        let keys = ["keep", "experiment", "vary", "set", "best", "name", "text", "files"];
+        let keys = ["keep", "design", "experiment", "vary", "set", "best", "name", "text", "files"];
         for key in keys {
             assert!(read(text.replace(&format!("\"{key}\":"), "\"other\":").as_bytes()).is_err(), "{key}");
         }
         let newer = text.replace("\"fric sweep\": 2", "\"fric sweep\": 3");
-        assert!(read(newer.as_bytes()).err().unwrap().contains("kind 3"));
+        assert!(read(newer.as_bytes()).err().unwrap().to_string().contains("kind 3"));
         let other = text.replace(&library(), "0123456789abcdef");
-        assert!(read(other.as_bytes()).err().unwrap().contains("another library"));
+        assert!(read(other.as_bytes()).err().unwrap().to_string().contains("another library"));
     }
 }

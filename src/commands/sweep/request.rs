@@ -5,10 +5,11 @@
 
 use super::SweepTable;
 use super::best::{self, Best};
+use super::version::Unusable;
 use crate::args::{Keep, Sweep};
 use crate::compile::{self, Changes, Loaded, Method, Options, Sources, Varying};
 use crate::report;
-use crate::vary::{How, Vary};
+use crate::vary::{self, How, Vary};
 use grammar::diagnostic::Diagnostic;
 
 /// A request for a table.
@@ -16,6 +17,8 @@ use grammar::diagnostic::Diagnostic;
 pub struct Request {
     pub experiment: String,
     pub vary: Vec<Vary>,
+    /// The table of a design, as the text of its file.
+    pub design: Option<String>,
     /// `fr.Fs=2 N`, as text.
     pub set: Vec<String>,
     pub method: Option<Method>,
@@ -39,6 +42,8 @@ pub enum Fault {
     Misused(String),
     /// Something fails that is not in the text.
     Failed(String),
+    /// A plan of another version.
+    Version(Unusable),
     /// Errors in the text: the report, and the diagnostics.
     Text(String, Vec<Diagnostic>),
 }
@@ -48,6 +53,7 @@ impl Fault {
     pub fn words(&self) -> String {
         match self {
             Fault::Misused(why) | Fault::Failed(why) | Fault::Text(why, _) => why.clone(),
+            Fault::Version(why) => format!("the plan {why}"),
         }
     }
 }
@@ -59,6 +65,7 @@ impl Request {
         Request {
             experiment: experiment.into(),
             vary: args.vary.clone(),
+            design: None,
             set,
             method,
             step,
@@ -83,24 +90,30 @@ impl Request {
 /// # Errors
 /// Why it cannot be run.
 pub fn table(request: Request, loaded: &mut Loaded, sources: &dyn Sources, colour: bool) -> Result<SweepTable, Fault> {
-    for (k, vary) in request.vary.iter().enumerate() {
-        let before = || request.vary[..k].iter().flat_map(Vary::paths);
+    let design = request.design.as_deref().map(vary::design).transpose();
+    let design = design.map_err(|why| Fault::Failed(format!("the design: {why}")))?.unwrap_or_default();
+    let all: Vec<&Vary> = design.iter().chain(&request.vary).collect();
+    for (k, vary) in all.iter().enumerate() {
+        let before = || all[..k].iter().flat_map(|vary| vary.paths());
         if let Some(twice) = vary.paths().find(|path| before().any(|other| other == *path)) {
-            return Err(Fault::Misused(format!("`{twice}` is varied twice; give it one --vary")));
+            return Err(Fault::Misused(format!(
+                "`{twice}` is varied twice; give it one --vary, or one column of the design"
+            )));
         }
         let set = |wanted: &&str| {
             request.set.iter().any(|text| text.split_once('=').is_some_and(|(path, _)| path.trim() == *wanted))
         };
         if let Some(path) = vary.paths().find(set) {
-            return Err(Fault::Misused(format!("`{path}` is both set and varied; leave out --set or --vary")));
+            return Err(Fault::Misused(format!("`{path}` is both set and varied; leave out one of the two")));
         }
     }
-    let (models, numbers): (Vec<Vary>, Vec<Vary>) =
+    let (models, grids): (Vec<Vary>, Vec<Vary>) =
         request.vary.iter().cloned().partition(|vary| matches!(vary.how, How::Models(_)));
+    let numbers = [design, grids].concat();
     let best = best::read(&request.best).map_err(Fault::Misused)?;
     let cases = compiled(&request, &models, &numbers, best.as_ref(), loaded, sources);
     let cases = cases.map_err(|found| Fault::Text(report::full(&loaded.files.0, &found, colour), found))?;
-    if request.vary.is_empty() && cases.len() == 1 {
+    if request.vary.is_empty() && numbers.is_empty() && cases.len() == 1 {
         return Err(Fault::Misused(format!(
             "nothing varies: add --vary 'PATH = 1 N .. 2 N by 0.1 N', or a `sweep` to `{}`",
             request.experiment

@@ -5,7 +5,8 @@
 //! of the runs, which the command resumes and which resume its own.
 
 use super::request::{self, Fault};
-use super::sink::{Before, Sink};
+use super::sink::{self, Before, Sink};
+use super::version::Unusable;
 use super::{SweepTable, plan, unit};
 use crate::compile::Loaded;
 use crate::parquet::Holds;
@@ -28,7 +29,10 @@ impl Sent {
     /// # Errors
     /// Why it cannot be used.
     pub fn read(bytes: &[u8], interpret: bool) -> Result<Sent, Fault> {
-        let about = |why: String| Fault::Failed(format!("the plan {why}"));
+        let about = |why| match why {
+            Unusable::NotWhole => Fault::Failed(format!("the plan {why}")),
+            Unusable::Version(..) | Unusable::Library => Fault::Version(why),
+        };
         let plan::Plan { mut request, text, hash } = plan::read(bytes).map_err(about)?;
         request.interpret = interpret;
         let (mut loaded, sources) = text.load();
@@ -79,6 +83,31 @@ impl Sent {
         write().expect("writing to memory does not fail")
     }
 
+    /// Rows of a file of a dataset.
+    pub fn rows_a_file(&self) -> u64 {
+        sink::rows_a_file(self.total())
+    }
+
+    /// Makes the file of a dataset that begins with this run, on this thread: the hash of its bytes. None if `stopped` was
+    /// set meanwhile.
+    ///
+    /// # Errors
+    /// Why it cannot be written, in words.
+    pub fn file(&self, folder: &Path, first: u64, stopped: &AtomicBool) -> Result<Option<String>, String> {
+        let runs = first..(first + self.rows_a_file()).min(self.total());
+        let (size, mut rows) = (runs.end - runs.start, Vec::new());
+        let put = &mut |_, row: &[u8]| {
+            rows.extend_from_slice(row);
+            Ok(())
+        };
+        let made = self.table.rows(runs, 1, &self.table.dice(), stopped, put).expect("memory does not fail");
+        if made < size {
+            return Ok(None);
+        }
+        let told = |error| format!("cannot write into {}: {error}", folder.display());
+        sink::write_part(&self.table, folder, first, &rows).map(Some).map_err(told)
+    }
+
     /// Begins a table or a dataset, or goes on with it. `warn` is called with damage that was found.
     ///
     /// # Errors
@@ -119,6 +148,14 @@ impl Rows {
             false => Ok(()),
         };
         unit::read(bytes, &sweep.hash, put).map(|_| ()).map_err(fault)
+    }
+
+    /// Takes a file of a dataset that [`Sent::file`] has written elsewhere.
+    ///
+    /// # Errors
+    /// If it is not there as it was written, in words.
+    pub fn adopt(&mut self, hash: &str) -> Result<(), String> {
+        self.sink.adopt(hash)
     }
 
     /// Keeps what has come; the table can be resumed.

@@ -67,6 +67,18 @@ fn part(folder: &Path, first: u64) -> PathBuf {
     folder.join(format!("part-{first:08}.parquet"))
 }
 
+/// Writes the file of a dataset with these rows, whole or not at all: the SHA-256 of its bytes, in hexadecimal.
+pub fn write_part(table: &SweepTable, folder: &Path, first: u64, rows: &[u8]) -> io::Result<String> {
+    let mut bytes = Vec::new();
+    parquet::from_csv(rows, false, &table.kinds(), &mut bytes)?;
+    project::write(&part(folder, first), &bytes)?;
+    Ok(hash_of(&bytes))
+}
+
+fn hash_of(bytes: &[u8]) -> String {
+    abi::image::sha256(bytes).iter().map(|byte| format!("{byte:02x}")).collect()
+}
+
 /// The file that tells what a dataset is.
 const ABOUT: &str = "_fric.json";
 
@@ -277,9 +289,7 @@ impl Sink {
                 rows.extend_from_slice(row);
                 if self.next.is_multiple_of(*each) || self.next == self.runs.end {
                     let first = (self.next - 1) / *each * *each;
-                    let mut bytes = Vec::new();
-                    parquet::from_csv(rows.as_slice(), false, &table.kinds(), &mut bytes)?;
-                    project::write(&part(&self.out, first), &bytes)?;
+                    write_part(table, &self.out, first, rows)?;
                     rows.clear();
                 }
             }
@@ -288,6 +298,28 @@ impl Sink {
             self.noted = Instant::now();
         }
         Ok(is_late)
+    }
+
+    /// Takes the next file of a dataset, which another process has written with this hash.
+    ///
+    /// # Errors
+    /// If it is not there as it was written, in words.
+    pub fn adopt(&mut self, hash: &str) -> Result<(), String> {
+        let Form::Dataset { each, .. } = self.form else {
+            return Err(format!("{} is no dataset, whose files others may write", self.out.display()));
+        };
+        let path = part(&self.out, self.next);
+        let bytes = fs::read(&path).map_err(|error| {
+            format!(
+                "a worker has written {}, which is not here ({error}): it needs a folder that all machines see under one name",
+                path.display()
+            )
+        })?;
+        if hash_of(&bytes) != hash {
+            return Err(format!("{} is not as a worker has written it", path.display()));
+        }
+        self.next = (self.next + each).min(self.runs.end);
+        Ok(())
     }
 
     /// Keeps what has come, for a later begin.

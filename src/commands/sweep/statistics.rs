@@ -231,6 +231,9 @@ pub struct Statistics<'t, W> {
     tally: Tally,
     groups: u64,
     words: Vec<Vec<String>>,
+    /// Verdicts and ends of all groups.
+    verdicts: Vec<(u64, u64)>,
+    ended: BTreeMap<String, Ended>,
 }
 
 impl<'t, W: Write> Statistics<'t, W> {
@@ -245,7 +248,8 @@ impl<'t, W: Write> Statistics<'t, W> {
         let mut words = vec![table.point(0, &dice).into_iter().map(|(title, _)| title).collect::<Vec<_>>()];
         words[0]
             .extend(["measure", "mean", "deviation", "least", "5 %", "median", "95 %", "greatest"].map(String::from));
-        Ok(Statistics { table, cut, dice, to, next: 0, tally, groups: 0, words })
+        let verdicts = tally.verdicts.clone();
+        Ok(Statistics { table, cut, dice, to, next: 0, tally, groups: 0, words, verdicts, ended: BTreeMap::new() })
     }
 
     /// Adds the row of the next run.
@@ -332,6 +336,12 @@ impl<'t, W: Write> Statistics<'t, W> {
         });
         let comma = if self.groups == 0 { "" } else { "," };
         self.groups += 1;
+        for (own, more) in self.verdicts.iter_mut().zip(&tally.verdicts) {
+            *own = (own.0 + more.0, own.1 + more.1);
+        }
+        for (kind, Ended { runs, first, status }) in tally.ended {
+            self.ended.entry(kind).or_insert(Ended { runs: 0, first, status }).runs += runs;
+        }
         write!(self.to, "{comma}\n{object}")
     }
 
@@ -342,6 +352,19 @@ impl<'t, W: Write> Statistics<'t, W> {
         let mut words = if self.words.len() > 1 { aligned(&self.words) } else { String::new() };
         if let more @ 1.. = self.groups.saturating_sub(MOST_LINES as u64) {
             words += &format!("  … and {} more points of the grids\n", count(more));
+        }
+        let verdicts = self.table.columns.iter().filter(|column| column.kind == ColumnKind::Verdict);
+        for (column, (held, judged)) in verdicts.zip(&self.verdicts) {
+            let share = significant(100.0 * *held as f64 / (*judged).max(1) as f64, 4);
+            words += &format!("  {} held in {} of {} runs ({share} %)\n", column.title, count(*held), count(*judged));
+        }
+        let mut ended: Vec<&Ended> = self.ended.values().filter(|ended| ended.status != "ok").collect();
+        ended.sort_by_key(|ended| ended.first);
+        for Ended { runs, first, status } in ended {
+            words += &match runs {
+                1 => format!("  run {first}: {status}\n"),
+                _ => format!("  {} runs such as {first}: {status}\n", count(*runs)),
+            };
         }
         Ok((self.to, words))
     }
