@@ -227,6 +227,51 @@ fn units_joined_have_the_bytes_of_one_machine() {
     assert!(sweeps < 10 || (failed > 20 && killed > 0), "{failed} failed runs, {killed} killed units");
 }
 
+/// A design against the sweep over the same values; what is wrong with one is told, and so is an engine without Python.
+#[test]
+fn a_design_gives_the_runs_of_its_rows() {
+    let folder = folder("design");
+    texts(&folder);
+    let mut chance = Chance(number("FRIC_SEED").unwrap_or(1));
+    let values: Vec<String> = (0..60).map(|_| format!("{:?}", chance.between(5.0, 79.0))).collect();
+    let list = format!("k = {}", values.iter().map(|k| format!("{k} N/m")).collect::<Vec<_>>().join(", "));
+    let text: String = values.iter().map(|k| format!("{k}\n")).collect();
+    fs::write(folder.join("k.csv"), format!("k [N/m]\n{text}")).unwrap();
+    let sweep = |more: &[&str], code| {
+        run(&folder, &[&["sweep", "spring.fric", "fixed", "-q", "--threads", "2"], more].concat(), code)
+    };
+    sweep(&["--vary", &list, "--out", "list.csv"], 0);
+    sweep(&["--design", "k.csv", "--out", "design.csv"], 0);
+    assert!(fs::read(folder.join("list.csv")).unwrap() == fs::read(folder.join("design.csv")).unwrap());
+    // Two columns change together, grids within each row, and a plan holds them.
+    fs::write(folder.join("km.csv"), "m [g],k [N/m]\n900,10\n1100,20\n").unwrap();
+    let both = ["--design", "km.csv", "--vary", "c = 0 N·s/m, 1 N·s/m"];
+    sweep(&[&both[..], &["--out", "km-t.csv"]].concat(), 0);
+    let (head, rows) = cells(&folder.join("km-t.csv"));
+    assert_eq!(head[..4], ["run", "m [g]", "k [N/m]", "c [N·s/m]"]);
+    let varied: Vec<String> = rows.iter().map(|row| row[1..4].join(" ")).collect();
+    assert_eq!(varied, ["900 10 0", "900 10 1", "1100 20 0", "1100 20 1"]);
+    run(&folder, &[&["sweep", "spring.fric", "fixed", "-q", "--plan", "p"], &both[..]].concat(), 0);
+    fs::remove_file(folder.join("km.csv")).unwrap();
+    run(&folder, &["sweep", "--unit", "0..4", "p", "-q", "--out", "u"], 0);
+    run(&folder, &["sweep", "--join", "p", "u", "-q", "--out", "joined.csv"], 0);
+    assert!(fs::read(folder.join("km-t.csv")).unwrap() == fs::read(folder.join("joined.csv")).unwrap());
+    for (text, words, code) in [
+        ("k [N/m]\n1\nx\n", "the design: line 3: `x` in the column `k [N/m]` is no number", 1),
+        ("k [kg]\n1\n", "cannot be a mass", 2),
+        ("nix [N]\n1\n", "`nix`", 1),
+        ("k [N/m]\n", "it has no rows", 1),
+    ] {
+        fs::write(folder.join("wrong.csv"), text).unwrap();
+        let (out, err) = sweep(&["--design", "wrong.csv"], code);
+        assert!((out + &err).contains(words), "{text:?}: {err}");
+    }
+    let (_, err) = sweep(&["--design", "k.csv", "--vary", "k = 1 N/m, 2 N/m"], 2);
+    assert!(err.contains("`k` is varied twice"), "{err}");
+    let (_, err) = sweep(&["--design", "k.csv", "--on", "dask://here:8786"], 2);
+    assert!(err.contains("pip install 'fric[dask]'"), "{err}");
+}
+
 /// Joined to Parquet, with plot and summary; and everything that is refused says why, and leaves a table as it was.
 #[test]
 fn what_is_no_unit_of_the_plan_is_refused() {
@@ -571,6 +616,7 @@ fn what_statistics_cannot_do_is_refused() {
     assert!(err.contains("at 40,000 points of the grids are too many"), "{err}");
     let (out, _) = sweep("--keep summary --no-error", 0);
     assert!(out.contains("measure") && out.contains("median") && out.contains("wrote sweep.json"), "{out}");
+    assert!(out.contains("max(x) < 0.2 m held in 297 of 297 runs (100 %)"), "{out}");
     let (out, _) = sweep("--keep both --out t.csv --no-error", 0);
     assert!(out.contains("wrote t.csv, t.json"), "{out}");
     // Blocks that were changed are made again; those of another sweep are refused.

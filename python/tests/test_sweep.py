@@ -4,8 +4,14 @@
 """
 
 import concurrent.futures
+import contextlib
+import json
 import os
+import pickle
+import random
+import shutil
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -43,12 +49,17 @@ def sweep(folder, runs=60, **how):
     return fric.sweep(folder / "pull.fric", "pulled", vary=VARY, runs=runs, seed=7, **how)
 
 
-def alone(command, folder, runs=60, out="alone.csv"):
+OPTIONS = ["--vary", "fr.Fs = 1 N .. 1.8 N by 0.2 N", "--vary", "m ~ lognormal(1 kg, 0.8)", "--seed", "7", "-q"]
+
+
+def alone(command, folder, runs=60, out="alone.csv", *more):
     """The sweep of the command on one thread."""
-    vary = ["--vary", "fr.Fs = 1 N .. 1.8 N by 0.2 N", "--vary", "m ~ lognormal(1 kg, 0.8)"]
-    how = ["--runs", str(runs), "--seed", "7", "-q", "--threads", "1", "--out", out]
-    subprocess.run([command, "sweep", "pull.fric", "pulled", *vary, *how], cwd=folder, check=True)
-    path = folder / out
+    how = ["--runs", str(runs), "--threads", "1", "--out", out, *more]
+    subprocess.run([command, "sweep", "pull.fric", "pulled", *OPTIONS, *how], cwd=folder, check=True)
+    return bytes_of(folder / out)
+
+
+def bytes_of(path):
     return path.read_bytes() if path.is_file() else contents(path)
 
 
@@ -102,8 +113,7 @@ def test_the_bytes_are_those_of_the_command(command, folder):
 
 def sweep_bytes(folder, name):
     sweep(folder, out=folder / name)
-    path = folder / name
-    return path.read_bytes() if path.is_file() else contents(path)
+    return bytes_of(folder / name)
 
 
 def test_what_varies_is_given_in_every_way(folder):
@@ -136,6 +146,16 @@ def test_what_varies_is_given_in_every_way(folder):
         ({"vary": {"m": "1 kg, 2 kg"}, "on": "spark://x"}, ValueError, "dask://"),
         ({"vary": {"m": "1 kg, 2 kg"}, "resume": True}, ValueError, "out="),
         ({"vary": {"m": "1 kg, 2 kg"}, "unit": 0}, ValueError, "positive"),
+        ({"vary": {"m": "1 kg, 2 kg"}, "keep": "sums"}, ValueError, "summary"),
+        ({"vary": {"m": "1 kg, 2 kg"}, "keep": "summary", "out": "t.csv"}, ValueError, ".json"),
+        ({"vary": {"m": "1 kg, 2 kg"}, "out": "t.json"}, ValueError, ".parquet"),
+        ({"vary": {"m": "1 kg, 2 kg"}, "shared": True}, ValueError, "out="),
+        ({"vary": {"m": "1 kg, 2 kg"}, "shared": True, "out": "t.csv"}, ValueError, "folder"),
+        ({"design": {"m": [1.0, 2.0], "fr.Fs": [1.0]}}, ValueError, "one length"),
+        ({"design": {"m": [1.0]}, "vary": {"m": "1 kg, 2 kg"}}, ValueError, "twice"),
+        ({"design": {"mm": [1.0]}}, fric.UnknownName, "mm"),
+        ({"design": {"m [N]": [1.0]}}, ValueError, "force"),
+        ({"design": np.zeros((3, 2))}, TypeError, "zip"),
         ({"vary": {"m": fric.uniform("0.3 kg", "4 kg")}, "runs": 2_000_000}, ValueError, "too many for memory"),
     ],
 )
@@ -180,8 +200,11 @@ def test_a_broken_pool_ends_a_sweep_that_another_engine_finishes(command, folder
     with concurrent.futures.ProcessPoolExecutor(2) as pool:
 
         def kill(done, total):
+            # A pool that breaks ends its processes before it tells.
             if done > total / 4:
-                os.kill(next(iter(pool._processes)), signal.SIGKILL)
+                with contextlib.suppress(ProcessLookupError):
+                    for process in list(pool._processes or ())[:1]:
+                        os.kill(process, signal.SIGKILL)
 
         with pytest.raises(fric.SweepError, match="resume=True") as raised:
             sweep(folder, runs, out=out, on=pool, unit=0.02, progress=kill)
@@ -191,6 +214,171 @@ def test_a_broken_pool_ends_a_sweep_that_another_engine_finishes(command, folder
         sweep(folder, runs, out=out)
     sweep(folder, runs, out=out, resume=True)
     assert out.read_bytes() == whole
+
+
+def test_statistics_alone_and_beside_rows_are_those_of_the_command(command, folder):
+    runs = 700
+    table = alone(command, folder, runs, "alone.csv", "--keep", "both")
+    whole = (folder / "alone.json").read_bytes()
+    with concurrent.futures.ProcessPoolExecutor(2) as pool:
+        found = sweep(folder, runs, out=folder / "t.json", keep="summary", on=pool, unit=0.05)
+        assert (folder / "t.json").read_bytes() == whole
+        both = sweep(folder, runs, out=folder / "t.csv", keep="both", on=pool, unit=0.05)
+    assert (folder / "t.csv").read_bytes() == table and (folder / "t.json").read_bytes() == whole
+    assert len(found) == len(both) == 5 * runs and len(found.groups) == 5
+    assert [group.point for group in found.groups] == [{"fr.Fs [N]": fs} for fs in (1.0, 1.2, 1.4, 1.6, 1.8)]
+    for k, group in enumerate(found.groups):
+        part = slice(k * runs, (k + 1) * runs)
+        for name in ("max(v)", "final(x)"):
+            values = both[name][part]
+            values, measured = values[~np.isnan(values)], group[name]
+            assert (measured.number, measured.missing) == (len(values), runs - len(values))
+            assert measured.mean == pytest.approx(values.mean(), rel=1e-12)
+            assert measured.deviation == pytest.approx(values.std(ddof=1), rel=1e-10)
+            assert (measured.least[0], measured.greatest[0]) == (values.min(), values.max())
+            for quantile in (0, 0.01, 0.3, 0.5, 0.95, 1):
+                exact = np.sort(values)[int(np.floor(quantile * (len(values) - 1) + 0.5))]
+                assert measured.quantile(quantile) == pytest.approx(exact, rel=1e-3)
+            assert measured.histogram[2].sum() == len(values)
+            lowest = np.argsort(both[name][part], kind="stable")[:16] + k * runs
+            assert [row["run"] for row in measured.lowest] == lowest.tolist()
+            assert measured.highest[0][measured.title] == values.max()
+        held = both["max(v) < 0.4 m/s"][part]
+        assert group.verdicts["max(v) < 0.4 m/s"] == (sum(x is True for x in held), sum(x is not None for x in held))
+        assert sum(number for _, number, _ in group.ended) == group.runs == runs
+    # Those in the file are the same as those computed from the histogram.
+    in_file = json.loads(whole)["groups"][0]["measures"][found.groups[0]["final(x)"].title]["quantiles"]
+    assert all(found.groups[0]["final(x)"].quantile(int(name[:-2]) / 100) == value for name, value in in_file.items())
+    frame = both.statistics.to_pandas()
+    assert len(frame) == 10 and frame["mean"].tolist()[0] == found.groups[0]["max(v)"].mean
+    here = fric.sweep(folder / "pull.fric", vary={"m": fric.uniform("0.5 kg", "2 kg")}, runs=300, keep="summary")
+    assert here.path is None and here["max(v)"].number == 300 and "median" in here.summary
+    with pytest.raises(KeyError, match="groups"):
+        found["max(v)"]
+    with pytest.raises(fric.UnknownName, match="max"):
+        here["max(w)"]
+
+
+def test_a_design_gives_the_rows_of_the_command(command, folder):
+    import pandas
+
+    rng = np.random.default_rng(5)
+    mass, force = rng.uniform(0.4, 4, 90), rng.uniform(1, 2, 90)
+    text = "m [g],fr.Fs [N]\n" + "".join(f"{1000 * m!r},{f!r}\n" for m, f in zip(mass.tolist(), force.tolist()))
+    (folder / "design.csv").write_text(text, encoding="utf-8")
+    how = ["--design", "design.csv", "-q", "--out", "alone.csv"]
+    subprocess.run([command, "sweep", "pull.fric", "pulled", *how], cwd=folder, check=True)
+    grams = pandas.DataFrame({"m [g]": 1000 * mass, "fr.Fs [N]": force})
+    for design in (grams, folder / "design.csv"):
+        fric.sweep(folder / "pull.fric", design=design, out=folder / "t.csv")
+        assert (folder / "t.csv").read_bytes() == (folder / "alone.csv").read_bytes()
+    table = fric.sweep(folder / "pull.fric", design={"m": mass, "fr.Fs": force}, vary={"x": "0 m, 1 mm"}, duration=0.1)
+    assert len(table) == 180 and table["m"].tolist() == np.repeat(mass, 2).tolist()
+    assert (table["x"] == np.tile([0.0, table["x"][1]], 90)).all() and (table["fr.Fs"] == np.repeat(force, 2)).all()
+
+
+def test_rows_come_in_order_and_an_iterator_may_be_left(folder):
+    whole = sweep(folder, 100)
+    with concurrent.futures.ProcessPoolExecutor(2) as pool:
+        for how in ({"threads": 2}, {"on": pool, "unit": 0.02}):
+            reached, parts = 0, []
+            for first, rows in fric.sweep_rows(folder / "pull.fric", "pulled", vary=VARY, runs=100, seed=7, **how):
+                assert first == reached
+                reached += len(rows)
+                parts.append(rows)
+            assert reached == 500 and len(parts) > 1
+            for title in whole.columns:
+                together = np.concatenate([rows[title] for rows in parts])
+                assert all(a == b or (a != a and b != b) for a, b in zip(together, whole[title])), title
+        for first, rows in fric.sweep_rows(folder / "pull.fric", vary=VARY, runs=100_000_000, on=pool, unit=0.02):
+            if first > 500:
+                break
+        # The pool is free for others.
+        assert pool.submit(abs, -1).result(timeout=60) == 1
+
+
+class Elsewhere:
+    """Workers with another version of fric: plans are another's to them."""
+
+    def __init__(self, executor):
+        self.executor = executor
+
+    def submit(self, function, plan, first, last):
+        version = f'"version": "{fric.__version__}"'.encode()
+        assert version in plan
+        old = plan.replace(version, b'"version": "0.0.9"') if first > 100 else plan
+        return self.executor.submit(function, old, first, last)
+
+
+def test_another_version_names_the_host_and_the_rest_is_resumed(command, folder):
+    whole = alone(command, folder)
+    out = folder / "t.csv"
+    with concurrent.futures.ProcessPoolExecutor(2) as pool:
+        with pytest.raises(fric.VersionMismatch, match=f"{socket.gethostname()} has fric .* pip install fric==0.0.9") as raised:
+            sweep(folder, out=out, on=Elsewhere(pool), unit=0.01)
+        error = raised.value
+        assert (error.host, error.planned, error.installed) == (socket.gethostname(), "0.0.9", fric.__version__)
+        assert error.missing[0][1] == 300 and isinstance(error, fric.SweepError)
+        again = pickle.loads(pickle.dumps(error))
+        assert (str(again), again.host, again.missing) == (str(error), error.host, error.missing)
+        sweep(folder, out=out, on=pool, resume=True)
+    assert out.read_bytes() == whole
+
+
+def test_workers_write_a_dataset_that_all_see(command, folder):
+    runs = 300
+    whole = alone(command, folder, runs, "alone")
+    assert len(whole) == 7
+    with concurrent.futures.ProcessPoolExecutor(2) as pool:
+        sweep(folder, runs, out=folder / "set", on=pool, shared=True)
+        assert contents(folder / "set") == whole
+        # Interrupted, and resumed without `shared`.
+        with pytest.raises(KeyboardInterrupt):
+            sweep(folder, runs, out=folder / "set", on=pool, shared=True, progress=interrupt)
+        assert not (folder / "set/_fric.json").exists()
+        sweep(folder, runs, out=folder / "set", resume=True)
+        assert contents(folder / "set") == whole
+        with pytest.raises(fric.SweepError, match="under one name|cannot write"):
+            sweep(folder, runs, out=folder / "other", on=Astray(pool), shared=True)
+
+
+def interrupt(done, total):
+    if done > total / 3:
+        raise KeyboardInterrupt
+
+
+class Astray:
+    """Workers that see another folder under the name of the client's."""
+
+    def __init__(self, executor):
+        self.executor = executor
+
+    def submit(self, function, plan, first, last):
+        return self.executor.submit(astray, function, plan, first, last)
+
+
+def astray(function, plan, first, last):
+    import tempfile
+
+    with tempfile.TemporaryDirectory() as folder:
+        return function.func(folder, plan, first, last)
+
+
+def test_tables_are_arrow_streams(folder):
+    pyarrow, polars = pytest.importorskip("pyarrow"), pytest.importorskip("polars")
+    table = sweep(folder)
+    frame = table.to_pandas()
+    for found in (pyarrow.table(table), polars.DataFrame(table).to_arrow()):
+        assert found.column_names == table.columns and found.num_rows == 300
+        assert found["run"].to_pylist() == list(range(300))
+        assert found["status"].to_pylist() == frame["status"].tolist()
+        assert found["max(v) < 0.4 m/s"].to_pylist() == [None if x is None else bool(x) for x in table["max(v) < 0.4 m/s"]]
+        assert np.array_equal(found["max(v) [m/s]"].to_numpy(), table["max(v)"], equal_nan=True)
+    assert None in table["max(v) < 0.4 m/s"].tolist()
+    address = pyarrow.table(table)["max(v) [m/s]"].chunk(0).buffers()[1].address
+    assert address == table["max(v)"].ctypes.data
+    sweep(folder, out=folder / "t.parquet")
+    assert pyarrow.table(fric.sweep(folder / "pull.fric", vary={"m": "1 kg, 2 kg"}, out=folder / "u.parquet")).num_rows == 2
 
 
 def test_ctrl_c_keeps_what_came_and_the_command_goes_on(command, folder):
@@ -227,6 +415,12 @@ def test_dask_gives_the_same_bytes_though_workers_are_killed(command, folder, cl
     print(f"{len(table)} runs in {took:.1f} s, workers killed at {killed}")
     assert len(killed) == 2
     assert (folder / "t.csv").read_bytes() == whole
+    # Statistics, with another death.
+    alone(command, folder, runs, "alone.json", "--keep", "summary")
+    killed.clear()
+    sweep(folder, runs, out=folder / "t.json", keep="summary", on=client, unit=0.1, progress=kill)
+    assert (folder / "t.json").read_bytes() == (folder / "alone.json").read_bytes()
+    assert alone(command, folder, runs, "alone.parquet") == bytes_of(sweep(folder, runs, out=folder / "t.parquet", on=client).path)
     # The dataset, through an address.
     address = cluster.scheduler_address.replace("tcp://", "dask://")
     sweep(folder, 60, out=folder / "set", on=address, unit=0.1)
@@ -234,36 +428,72 @@ def test_dask_gives_the_same_bytes_though_workers_are_killed(command, folder, cl
 
 
 CLIENT = """
-import sys, fric
-from test_sweep import sweep
+import sys
 from pathlib import Path
-from distributed import Client
+from test_sweep import sweep
+
 if __name__ == "__main__":
-    folder, scheduler, runs = Path(sys.argv[1]), sys.argv[2], int(sys.argv[3])
-    with Client(scheduler) as client:
-        sweep(folder, runs, out=folder / "t.csv", on=client, unit=0.05, resume=True)
+    folder, name, keep, scheduler, runs = Path(sys.argv[1]), sys.argv[2], sys.argv[3], sys.argv[4], int(sys.argv[5])
+    how = dict(out=folder / name, keep=keep, unit=0.05, resume=sys.argv[6] == "resume")
+    if scheduler == "threads":
+        sweep(folder, runs, threads=2, **how)
+    else:
+        from distributed import Client
+
+        with Client(scheduler) as client:
+            sweep(folder, runs, on=client, **how)
 """
 
 
-def test_a_killed_client_is_resumed_on_another_engine(command, folder, cluster):
-    runs = 400
-    whole = alone(command, folder, runs)
+@pytest.mark.parametrize("name", ["t.csv", "t.parquet", "set", "t.json"])
+def test_a_client_killed_five_times_and_engines_in_turn_give_the_same_bytes(command, folder, cluster, seed, name):
+    """Of the engines threads here, the command, Dask and units of the command, chosen at random; so are the times."""
+    runs, chance = 500, random.Random(f"{seed} {name}")
+    keep = "summary" if name.endswith(".json") else "rows"
+    more = ["--keep", keep]
+    whole = alone(command, folder, runs, f"alone{Path(name).suffix}", *more)
     (folder / "client.py").write_text(CLIENT, encoding="utf-8")
-    arguments = [sys.executable, str(folder / "client.py"), str(folder), cluster.scheduler_address, str(runs)]
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
-    out = folder / "t.csv"
-    seen = 0
-    for part in (0.1, 0.3):
-        child = subprocess.Popen(arguments, env=environment)
-        while child.poll() is None and (not out.exists() or out.read_bytes().count(b"\n") < 5 * runs * part):
-            time.sleep(0.01)
+    out, unfinished = folder / name, folder / (f".{name}.unfinished" if name != "set" else "set/._fric.json.unfinished")
+    plan = ["--runs", str(runs), *more, "--plan", "p.fricjob"]
+    subprocess.run([command, "sweep", "pull.fric", "pulled", *OPTIONS, *plan], cwd=folder, check=True)
+
+    def begin(engine):
+        """Begins or resumes the sweep by an engine; for units the next one."""
+        resume = ["resume"] if unfinished.exists() else ["begin"]
+        if engine == "command":
+            how = ["--runs", str(runs), "--threads", "1", "--out", name, *more, *(["--resume"] if resume == ["resume"] else [])]
+            return [command, "sweep", "pull.fric", "pulled", *OPTIONS, *how]
+        if engine == "units":
+            which = f"{chance.randrange(8)}/8"
+            return [command, "sweep", "--unit", which, "p.fricjob", "-q", "-o", f"{which[0]}.fricunit"]
+        scheduler = "threads" if engine == "threads" else cluster.scheduler_address
+        return [sys.executable, str(folder / "client.py"), str(folder), name, keep, scheduler, str(runs), *resume]
+
+    killed = []
+    engines = ["threads", "command", "dask", "units"]
+    while len(killed) < 5:
+        if out.exists() and not unfinished.exists():
+            # It was finished before its time: the next kills begin anew.
+            out.unlink() if out.is_file() else shutil.rmtree(out)
+        engine = engines[len(killed)] if len(killed) < 4 else chance.choice(engines)
+        child = subprocess.Popen(begin(engine), cwd=folder, env=environment)
+        # Python takes its time to begin.
+        time.sleep(chance.uniform(0, 0.5 if engine in ("command", "units") else 3))
         child.kill()
         child.wait()
-        seen = max(seen, out.read_bytes().count(b"\n"))
-    assert 5 * runs * 0.3 <= seen
-    if (folder / ".t.csv.unfinished").exists():
-        sweep(folder, runs, out=out, threads=2, resume=True)
-    assert out.read_bytes() == whole
+        killed.append(engine)
+    engine = chance.choice(engines)
+    print(f"seed {seed}: {name}, killed {killed}, finished by {engine}")
+    if engine == "units":
+        for k in range(8):
+            subprocess.run([command, "sweep", "--unit", f"{k}/8", "p.fricjob", "-q", "-o", f"{k}.fricunit"], cwd=folder, check=True)
+        units = [f"{k}.fricunit" for k in chance.sample(range(8), 8)]
+        subprocess.run([command, "sweep", "--join", "p.fricjob", *units, "-q", "--out", name], cwd=folder, check=True)
+    elif unfinished.exists() or not out.exists() or (name == "set" and not (out / "_fric.json").exists()):
+        subprocess.run(begin(engine), cwd=folder, env=environment, check=True)
+    assert bytes_of(out) == whole
+    assert not unfinished.exists()
 
 
 class Poisoned:
@@ -304,6 +534,29 @@ def test_a_run_that_ends_its_workers_is_named_and_all_others_are_there(command, 
         text=True,
     )
     assert missing.stdout == "0..131\n"
+
+
+def test_the_command_sends_units_to_a_cluster(command, folder, cluster):
+    whole = alone(command, folder)
+    address = cluster.scheduler_address.replace("tcp://", "dask://")
+    on = [command, "sweep", "pull.fric", "pulled", *OPTIONS, "--runs", "60", "--on", address]
+    subprocess.run([*on, "--out", "t.csv"], cwd=folder, check=True)
+    assert (folder / "t.csv").read_bytes() == whole
+    alone(command, folder, 60, "alone.json", "--keep", "summary")
+    subprocess.run([*on, "--keep", "summary"], cwd=folder, check=True)
+    assert (folder / "sweep.json").read_bytes() == (folder / "alone.json").read_bytes()
+    for options, words in [(["--threads", "2"], "--threads and --on"), (["--out", "t.txt"], ".parquet")]:
+        failed = subprocess.run([*on, *options], cwd=folder, capture_output=True, text=True)
+        assert failed.returncode in (1, 2) and words in failed.stderr, failed.stderr
+
+
+def test_submitit_runs_units_on_its_local_executor(command, folder):
+    submitit = pytest.importorskip("submitit")
+    whole = alone(command, folder)
+    executor = submitit.LocalExecutor(folder=str(folder / "jobs"))
+    executor.update_parameters(timeout_min=5)
+    sweep(folder, out=folder / "t.csv", on=executor, unit=1)
+    assert (folder / "t.csv").read_bytes() == whole
 
 
 def test_threads_of_python_run_on(folder):
