@@ -1,9 +1,14 @@
 //! What a release holds: `.ci/release pack` packs the programs of this build.
 
+#[path = "support/fric_rig.rs"]
+mod fric_rig;
+
+use fric_rig::FRIC_RIG;
 use std::collections::BTreeSet;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
+use std::sync::LazyLock;
 
 /// Packs the programs in `bin` into a new folder.
 fn packed(bin: &Path, name: &str) -> PathBuf {
@@ -34,11 +39,7 @@ fn listed(folder: &Path, program: &str, args: &[&str]) -> BTreeSet<String> {
 #[test]
 fn a_release_is_complete_runs_and_repeats_to_the_byte() {
     let bin = Path::new(env!("CARGO_BIN_EXE_fric")).parent().unwrap();
-    if !bin.join("fric-rig").exists() {
-        let mut build = Command::new(std::env::var("CARGO").unwrap_or_else(|_| "cargo".into()));
-        build.current_dir(env!("CARGO_MANIFEST_DIR")).args(["build", "--offline", "-p", "fric-rig"]);
-        assert!(build.status().unwrap().success(), "fric-rig is needed for this test and cannot be built");
-    }
+    LazyLock::force(&FRIC_RIG);
     let out = packed(bin, "release");
     let (version, machine) = (env!("CARGO_PKG_VERSION"), std::env::consts::ARCH);
     let debian = if machine == "aarch64" { "arm64" } else { "amd64" };

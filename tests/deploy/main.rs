@@ -5,15 +5,17 @@
 mod debian;
 #[path = "../agreement/emulator.rs"]
 mod emulator;
+#[path = "../support/fric_rig.rs"]
+mod fric_rig;
 mod fuzz;
 mod package;
 mod ssh;
 mod trust;
 
+use fric_rig::FRIC_RIG;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
-use std::sync::LazyLock;
 
 /// A rig on a simulated bus: it needs no hardware and arms itself.
 const RIG: &str = r#"
@@ -109,14 +111,3 @@ fn fails(folder: &Path, args: &[&str], why: &str) {
     let told = said(&output);
     assert!(output.status.code() == Some(1) && told.contains(why), "fric {args:?}\n{told}");
 }
-
-/// The `fric-rig` program, built beside this one.
-static FRIC_RIG: LazyLock<PathBuf> = LazyLock::new(|| {
-    let beside = Path::new(env!("CARGO_BIN_EXE_fric")).with_file_name("fric-rig");
-    if !beside.exists() {
-        let mut build = Command::new(env!("CARGO"));
-        build.current_dir(env!("CARGO_MANIFEST_DIR")).args(["build", "--offline", "-p", "fric-rig"]);
-        assert!(build.status().unwrap().success(), "fric-rig is needed for this test and cannot be built");
-    }
-    beside
-});

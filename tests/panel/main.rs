@@ -6,6 +6,8 @@ mod browser;
 mod client;
 #[path = "../support/debian.rs"]
 mod debian;
+#[path = "../support/fric_rig.rs"]
+mod fric_rig;
 mod hostile;
 mod opened;
 mod operated;

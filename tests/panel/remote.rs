@@ -1,6 +1,7 @@
 //! The panel of a rig that `fric-rig` runs, beside it and from another computer.
 
 use crate::browser::{Page, browser};
+use crate::fric_rig::FRIC_RIG;
 use crate::{folder, fric};
 use serde_json::json;
 use std::fs;
@@ -8,7 +9,6 @@ use std::io::{BufRead, BufReader, Read};
 use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
-use std::sync::LazyLock;
 use std::time::{Duration, Instant};
 
 /// A rig at a rate that a busy computer keeps, on a simulated bus: it arms itself.
@@ -50,14 +50,6 @@ rig slow {
   tune     fr.vs, fr.Fs in 0.3 N·m .. 0.6 N·m
 }
 "#;
-
-/// The program of the rig's computer, built beside this one.
-static FRIC_RIG: LazyLock<PathBuf> = LazyLock::new(|| {
-    let mut build = Command::new(env!("CARGO"));
-    build.current_dir(crate::root()).args(["build", "--offline", "-p", "fric-rig"]);
-    assert!(build.status().unwrap().success(), "fric-rig is needed for this test and cannot be built");
-    Path::new(env!("CARGO_BIN_EXE_fric")).with_file_name("fric-rig")
-});
 
 /// A program that runs, until dropped.
 struct Running {
