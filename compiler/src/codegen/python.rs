@@ -2,7 +2,7 @@
 //!
 //! In: a program without delays, sampled blocks, events and resets, before its elementary functions are expanded. Out: a
 //! module with `f(t, x, u, p) -> dx, y`, which other libraries differentiate, compile and optimise. Its values agree with
-//! those of the other back ends within rounding, not to the bit. One writer serves all dialects; a [`Spelling`] has what
+//! those of the other back ends within rounding, not to the bit. One writer serves all dialects; a `Spelling` has what
 //! they write differently.
 
 use super::c::{comment, identifier, range};
