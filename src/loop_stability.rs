@@ -46,6 +46,14 @@ impl Standing {
 
 /// The drives whose torque depends on the speed of the shaft.
 pub fn contacts(ready: &CompiledRig) -> Vec<Contact> {
+    let mut all = candidates(ready);
+    all.retain(|contact| contact.acts(ready));
+    all
+}
+
+/// The drives whose torque may depend on the speed of the shaft, with some values of parameters that may change while the
+/// rig runs.
+pub fn candidates(ready: &CompiledRig) -> Vec<Contact> {
     let rig = &ready.rig;
     let looks = Wired::of(rig, &ready.plant, |_| 0).ok().flatten();
     let told =
@@ -78,18 +86,19 @@ pub fn contacts(ready: &CompiledRig) -> Vec<Contact> {
         let own = signals.iter().map(|(.., from)| *from == output.signal.node).collect();
         let told = told.filter(|_| rig.predict == Some(output.signal.node));
         let drive = node.name.clone();
-        let contact = Contact { drive, inputs, own, derivative, shaft, position, told, late };
-        let at_rest = contact.at(ready, &[], 0.0);
-        if at_rest.step.b.iter().any(|b| *b != 0.0) && contact.stiffness(&at_rest) != 0.0
-            || at_rest.step.d.iter().any(|d| *d != 0.0)
-        {
-            out.push(contact);
-        }
+        out.push(Contact { drive, inputs, own, derivative, shaft, position, told, late });
     }
     out
 }
 
 impl Contact {
+    /// Whether its torque depends on the speed with the present values.
+    fn acts(&self, ready: &CompiledRig) -> bool {
+        let at_rest = self.at(ready, &[], 0.0);
+        at_rest.step.b.iter().any(|b| *b != 0.0) && self.stiffness(&at_rest) != 0.0
+            || at_rest.step.d.iter().any(|d| *d != 0.0)
+    }
+
     /// The loop with these parameters, linearised at a constant speed after transients have decayed.
     pub fn at(&self, ready: &CompiledRig, params: &[(Slot, f64)], speed: f64) -> Loop {
         let rig = &ready.rig;
@@ -148,9 +157,14 @@ impl Contact {
 
 /// The reasons why a rig must not move, in words; and whether it is stable only with the predictor.
 pub fn objections(ready: &CompiledRig) -> (Vec<String>, bool) {
+    objections_to(&candidates(ready), ready)
+}
+
+/// The same with the present values of parameters; the contacts are those that may act.
+pub fn objections_to(contacts: &[Contact], ready: &CompiledRig) -> (Vec<String>, bool) {
     let period = ready.rig.period_ns as f64 * 1e-9;
     let (mut found, mut needs_look) = (Vec::new(), false);
-    for contact in contacts(ready) {
+    for contact in contacts.iter().filter(|contact| contact.acts(ready)) {
         let standing = contact.standing(ready);
         needs_look |= standing.plain >= 1.0 && standing.ahead.is_some();
         if !standing.is_stable() {

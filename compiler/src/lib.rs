@@ -33,6 +33,7 @@ pub use crate::frontend::resolve::{ExperimentInfo, Loaded, load};
 pub use crate::frontend::source::{Files, NoSources, SourceFile, Sources};
 pub use experiment::Changes;
 
+use abi::live::Check;
 use abi::plan::Method;
 use abi::table::Code;
 use abi::{Description, Function, Instance, Slice, Slot};
@@ -352,6 +353,7 @@ pub fn linear(
 }
 
 /// A rig, ready to run.
+#[derive(Clone)]
 pub struct CompiledRig {
     /// The plan of the rig.
     pub rig: abi::rig::Rig,
@@ -371,6 +373,66 @@ pub struct CompiledRig {
     pub judge_program: ir::program::Program,
     /// Notes for the user, such as: this processor lacks instructions that machine code needs.
     pub notes: Vec<String>,
+    /// The rig before it was lowered.
+    cut: Arc<rig::PartitionedRig>,
+}
+
+impl CompiledRig {
+    /// Sets parameters that may change while the rig runs ([`abi::live::Tunable::Live`]), SI. Afterwards its control
+    /// program is the one that a start with these values would compile.
+    pub fn set(&mut self, values: &[(Slot, f64)]) {
+        let params = self.program.description.layout.params.range();
+        for (slot, value) in values {
+            self.control.set(*slot, *value);
+            self.program.params[slot.index() - params.start] = *value;
+        }
+        if self.live.checks.is_empty() {
+            return;
+        }
+        for (control, judge) in self.live.places() {
+            self.judge.set(judge, self.control.get(control));
+        }
+        self.judge.call(Function::Outputs);
+        // A range whose ends follow from parameters follows them.
+        for check in &self.live.checks {
+            let Check::Range { path, .. } = check else { continue };
+            let [_, low, high] = check.numbers(self.judge.block());
+            let quantities = &mut self.program.description.quantities;
+            if let Some(quantity) = quantities.iter_mut().find(|quantity| quantity.path == *path) {
+                quantity.range.0 = if low.is_nan() { quantity.range.0 } else { low };
+                quantity.range.1 = if high.is_nan() { quantity.range.1 } else { high };
+            }
+        }
+    }
+
+    /// The errors of a start with the present values that the conditions on parameters ([`CompiledRig::live`]) do not
+    /// include: `tune` goes beyond a range, or the fixed step is not stable. `files`: those of the text that was compiled.
+    pub fn start_errors(&self, files: &Files) -> Vec<Diagnostic> {
+        let beyond_range = |tuned: &abi::live::Tuned| {
+            let path = &self.live.params[tuned.param].path;
+            let range = self.live.checks.iter().find_map(|check| match check {
+                Check::Range { path: other, low, high, .. } if other == path => {
+                    let [_, least, most] = check.numbers(self.judge.block());
+                    let bound = |number: f64, bound: &Option<(Slot, bool)>| {
+                        bound.as_ref().map(|(_, strict)| (number, *strict)).filter(|_| !number.is_nan())
+                    };
+                    Some((bound(least, low), bound(most, high)))
+                }
+                _ => None,
+            });
+            let (low, high) = range?;
+            let ends = [tuned.range.0, tuned.range.1].into_iter().filter(|end| end.is_finite());
+            let wrong = ends.filter_map(|end| abi::live::beyond(end, low, high)).next();
+            wrong.map(|_| Diagnostic::error("E0502", format!("`tune` goes beyond the range of `{path}`")))
+        };
+        let mut found: Vec<Diagnostic> = self.live.tuned.iter().filter_map(beyond_range).collect();
+        if found.is_empty() {
+            let control = (&self.cut.control, &self.cut.control_types);
+            found = self.cut.stability(control, &self.rig, &self.program, files);
+            found.retain(Diagnostic::is_error);
+        }
+        found
+    }
 }
 
 /// Compiles a rig of a loaded text. Only `set` of the changes in `options` has an effect.
@@ -383,7 +445,7 @@ pub fn rig(
     options: &Options,
     warnings: &mut Vec<Diagnostic>,
 ) -> Result<CompiledRig, Vec<Diagnostic>> {
-    let lowered = lowered_rig(loaded, sources, name, options, warnings)?;
+    let (cut, lowered) = lowered_rig(loaded, sources, name, options, warnings)?;
     let rig::Lowered { rig, control, plant, live, judge } = lowered;
     let make = |program: &ir::program::Program, functions: &[(Function, ir::Func)]| {
         let (code, notes) = code(functions, &program.description, options.interpret);
@@ -402,6 +464,7 @@ pub fn rig(
         judge: judge_made,
         judge_program: judge,
         notes,
+        cut: Arc::new(cut),
     })
 }
 
@@ -417,7 +480,7 @@ fn lowered_rig(
     name: &str,
     options: &Options,
     warnings: &mut Vec<Diagnostic>,
-) -> Result<rig::Lowered, Vec<Diagnostic>> {
+) -> Result<(rig::PartitionedRig, rig::Lowered), Vec<Diagnostic>> {
     let (cut, lowered) = cut_rig(loaded, sources, name, options, warnings)?;
     let control = (&cut.control, &cut.control_types);
     let steps = cut.steps(control, &lowered.rig, &lowered.control, &loaded.files);
@@ -425,7 +488,7 @@ fn lowered_rig(
         return Err(steps);
     }
     warnings.extend(steps);
-    Ok(lowered)
+    Ok((cut, lowered))
 }
 
 /// A rig before and after lowering.

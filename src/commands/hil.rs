@@ -16,7 +16,6 @@ use runtime::drive::profiles::Life;
 use runtime::hil::control::PATIENT_NS;
 use runtime::hil::cycle::{Gauges, Hil, Options as HilOptions};
 use runtime::hil::identify::{self, Identification};
-use runtime::hil::live::Judge;
 use runtime::hil::session::{self, Drives, Finished, Session, Setup};
 use runtime::hil::simulated::{Pace, World};
 use runtime::hil::{cycle, emergency, watches, words};
@@ -88,24 +87,14 @@ fn once(args: &Args, company: &mut Company, terminal: &mut Terminal) -> End {
         .with("set", set.join("\n"))
         .with("started", session::started(drives));
     let head = keeping.into(head);
-    let log = Some((log_settings(args, &name, &ready, (drives, company)), head.clone()));
+    let log = Some((log_settings(args, &name, &ready, (drives, company)), head));
     if args.identify {
         return identified(args, ready, drives, company, terminal);
     }
     let Some(needs_look) = bearable(args, &ready, terminal) else { return End::Failed };
     ready.rig.needs_look = needs_look;
     emergency::guard();
-    let rehearsal = Rehearsal {
-        judge: Judge::new(ready.live.clone(), ready.judge.clone(), &ready.control)
-            .expect("the compiler made them for each other"),
-        control: ready.control.clone(),
-        loaded,
-        kept: head,
-        name,
-        set: args.set.all.clone(),
-        accept_unstable: args.accept_unstable,
-        needs_look,
-    };
+    let rehearsal = Rehearsal::new(ready.clone(), loaded, args.accept_unstable, needs_look);
     let asked = Asked { log, rehearsal: Some(rehearsal), ..Asked::default() };
     with_buses(args, ready, drives, (asked, company), terminal)
 }
@@ -324,7 +313,7 @@ fn run(
             drives,
             options,
             log,
-            judge: rehearsal.as_ref().map(|rehearsal| rehearsal.judge.clone()),
+            judge: rehearsal.as_ref().map(|rehearsal| rehearsal.judge().clone()),
             needs_real_time: "this host gives no real time, see above",
         };
         Session::start(setup, clock, buses)

@@ -5,11 +5,10 @@
 //! people may ask for the next one.
 
 use super::beside::Asked;
-use crate::compile::{self, Changes, Loaded, Options};
-use crate::loop_stability;
-use crate::source_snapshot::Kept;
+use crate::compile::{CompiledRig, Loaded};
+use crate::loop_stability::{self, Contact};
 use crate::terminal::Terminal;
-use abi::Instance;
+use abi::Slot;
 use abi::format::quantity;
 use abi::live::{Param, Tunable};
 use grammar::diagnostic::Diagnostic;
@@ -17,7 +16,6 @@ use runtime::hil::line::{Assignment, Door, Line, RUNS};
 use runtime::hil::live::{Judge, Set};
 use runtime::hil::operator::{Answer, Command, Operator, Reason, Stopper};
 use runtime::hil::origin::Origin;
-use runtime::record::log::Sections;
 use std::io::BufRead;
 use std::sync::mpsc::{Receiver, Sender, channel};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -30,56 +28,49 @@ const HELP: &str = "enable, arm: as the drives ask for it; set PATH = VALUE, …
 /// Validates sets of parameters before the cycle receives them.
 ///
 /// The cycle checks the constraints of the start. The stability of the fixed step and of the contacts needs a compiler:
-/// the rig is compiled once more with the values of the set, from the texts of the run, even if the files have changed
-/// since.
+/// it is analysed anew with the values of the set, for the programs of this run, as a start with these values would.
 pub struct Rehearsal {
-    /// The constraints.
-    pub judge: Judge,
-    /// The control program with the active values.
-    pub control: Instance,
-    /// The texts as they were read.
-    pub loaded: Loaded,
-    /// Their imports: the head of the log.
-    pub kept: Sections,
-    /// The rig.
-    pub name: String,
-    /// `--set` of the start, then the sets in effect: path and value.
-    pub set: Vec<(String, String)>,
+    judge: Judge,
+    /// The rig with the active values.
+    ready: CompiledRig,
+    /// Its texts, as they were read.
+    loaded: Loaded,
+    /// The contacts that may be unstable with some values.
+    contacts: Vec<Contact>,
     /// Whether contacts may be unstable.
-    pub accept_unstable: bool,
+    accept_unstable: bool,
     /// Whether this run stops if its predictor fails.
-    pub needs_look: bool,
+    needs_look: bool,
 }
 
 impl Rehearsal {
-    /// The values of a start, with these replaced.
-    fn with(&self, set: &[Assignment]) -> Vec<(String, String)> {
-        let mut all = self.set.clone();
-        for Assignment { path, value } in set {
-            all.retain(|(other, _)| other != path);
-            all.push((path.clone(), value.clone()));
-        }
-        all
+    /// For a rig that is about to run. `accept_unstable`: its contacts may be unstable; `needs_look`: this run stops if its
+    /// predictor fails.
+    pub fn new(ready: CompiledRig, loaded: Loaded, accept_unstable: bool, needs_look: bool) -> Rehearsal {
+        let judge = Judge::new(ready.live.clone(), ready.judge.clone(), &ready.control);
+        let judge = judge.expect("the compiler made them for each other");
+        let contacts = loop_stability::candidates(&ready);
+        Rehearsal { judge, ready, loaded, contacts, accept_unstable, needs_look }
     }
 
-    /// Validates a set; `all`: the values of a start that would lead to it.
-    ///
-    /// # Errors
-    /// What a start would refuse, in words.
-    fn judge(&mut self, set: &Set, all: &[(String, String)]) -> Result<(), String> {
-        let broken = self.judge.judge(self.control.block(), set.values());
-        broken.map_err(|objection| self.judge.words(&objection))?;
-        let set = all.iter().map(|(path, value)| format!("{path}={value}")).collect();
-        let options = Options { changes: Changes { set, ..Changes::default() }, interpret: true };
-        let ready = compile::rig(&mut self.loaded, &Kept(&self.kept), &self.name, &options, &mut Vec::new());
-        let ready = ready.map_err(|errors| {
+    /// What decides which parameters may change.
+    pub fn judge(&self) -> &Judge {
+        &self.judge
+    }
+
+    /// Why a start with the active values, of which these are new, would be refused, or this run could not go on with them.
+    fn objection(&mut self, set: &Set) -> Result<(), String> {
+        let held = self.judge.judge(self.ready.control.block(), set.values());
+        held.map_err(|objection| self.judge.words(&objection))?;
+        let errors = self.ready.start_errors(&self.loaded.files);
+        if !errors.is_empty() {
             let words = |error: &Diagnostic| format!("{}: {}", error.code, error.message);
-            errors.iter().filter(|error| error.is_error()).map(words).collect::<Vec<_>>().join("; ")
-        })?;
+            return Err(errors.iter().map(words).collect::<Vec<_>>().join("; "));
+        }
         if self.accept_unstable {
             return Ok(());
         }
-        let (against, needs_look) = loop_stability::objections(&ready);
+        let (against, needs_look) = loop_stability::objections_to(&self.contacts, &self.ready);
         if !against.is_empty() {
             return Err(against.join("; "));
         }
@@ -101,8 +92,8 @@ impl Rehearsal {
     /// The active value of a parameter, in its unit.
     fn value(&self, param: &Param) -> String {
         match (&param.place, param.boolean) {
-            (Tunable::Live(slot, _), true) => (self.control.get(*slot) != 0.0).to_string(),
-            (Tunable::Live(slot, _), false) => quantity(self.control.get(*slot), &param.unit, 6),
+            (Tunable::Live(slot, _), true) => (self.ready.control.get(*slot) != 0.0).to_string(),
+            (Tunable::Live(slot, _), false) => quantity(self.ready.control.get(*slot), &param.unit, 6),
             (Tunable::Start(_), _) => "read by a start".into(),
         }
     }
@@ -110,25 +101,29 @@ impl Rehearsal {
     /// Sends a set to the cycle if a start would accept it. Returns what has changed, in words, and the cycle.
     fn change(&mut self, operator: &mut Operator, wanted: &[Assignment]) -> Result<Done, String> {
         let set = self.judge.read(wanted)?;
-        let all = self.with(wanted);
-        self.judge(&set, &all)?;
-        let cycle = match operator.wait(Command::Set(set)) {
-            Answer::Taken(cycle) => cycle,
-            Answer::Refused(Reason::Set(objection)) => return Err(self.judge.words(&objection)),
-            Answer::Refused(why) => return Err(why.words()),
+        let before: Vec<(Slot, f64)> =
+            set.values().iter().map(|(slot, _)| (*slot, self.ready.control.get(*slot))).collect();
+        let shown = |rehearsal: &Rehearsal| -> Vec<String> {
+            let params = &rehearsal.judge.live().params;
+            let param =
+                |slot: Slot| params.iter().find(|param| matches!(param.place, Tunable::Live(at, _) if at == slot));
+            set.values().iter().filter_map(|(slot, _)| param(*slot)).map(|param| rehearsal.value(param)).collect()
         };
-        let mut said = Vec::new();
-        for (slot, value) in set.values() {
-            let live = self.judge.live().params.iter();
-            let param = live.clone().find(|param| matches!(param.place, Tunable::Live(at, _) if at == *slot)).cloned();
-            let before = param.as_ref().map(|param| self.value(param));
-            self.control.set(*slot, *value);
-            if let (Some(param), Some(before)) = (param, before) {
-                said.push(format!("{} {before} → {}", param.path, self.value(&param)));
-            }
+        let old = shown(self);
+        self.ready.set(set.values());
+        let taken = self.objection(&set).and_then(|()| match operator.wait(Command::Set(set)) {
+            Answer::Taken(cycle) => Ok(cycle),
+            Answer::Refused(Reason::Set(objection)) => Err(self.judge.words(&objection)),
+            Answer::Refused(why) => Err(why.words()),
+        });
+        if taken.is_err() {
+            self.ready.set(&before);
         }
-        self.set = all;
-        Ok(Done { words: said.join(", "), cycle })
+        let cycle = taken?;
+        let changed = wanted.iter().zip(old.iter().zip(shown(self)));
+        let words: Vec<String> =
+            changed.map(|(Assignment { path, .. }, (old, new))| format!("{path} {old} → {new}")).collect();
+        Ok(Done { words: words.join(", "), cycle })
     }
 }
 

@@ -348,7 +348,7 @@ fn the_buttons_enable_and_arm_a_rig() {
 
 /// A client of its own on the page's connection, as `client`: it draws what comes, and `ask(line)` gives the time in ms to
 /// the answer of the panel, or of the rig where that answers.
-const CLIENT: &str = r#"new Promise(ready => {
+pub const CLIENT: &str = r#"new Promise(ready => {
     const s = new WebSocket(`ws://${location.host}/socket`), waits = new Map(), rigs = new Map();
     let number = 0, end = 0;
     s.binaryType = 'arraybuffer';
@@ -407,7 +407,7 @@ fn a_command_reaches_the_next_cycle_soon() {
     for (what, (median, least, most)) in [
         ("page, panel, page", page_and_panel),
         ("page, panel, prompt, next cycle and back", and_cycle),
-        ("the same with a set, which is compiled and judged before", set),
+        ("the same with a set, which is judged before", set),
     ] {
         println!("{what}: median {median:.1} ms, {least:.1} to {most:.1} ms");
     }

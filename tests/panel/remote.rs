@@ -2,13 +2,16 @@
 
 use crate::browser::{Page, browser};
 use crate::fric_rig::FRIC_RIG;
+use crate::operated::CLIENT;
 use crate::{folder, fric};
+use runtime::hil::line::{Door, Line};
 use serde_json::json;
 use std::fs;
-use std::io::{BufRead, BufReader, Read};
+use std::io::{BufRead, BufReader, Read, Write};
 use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
+use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 /// A rig at a rate that a busy computer keeps, on a simulated bus: it arms itself.
@@ -62,7 +65,10 @@ impl Running {
     /// Starts a program that prints the link of a panel; what it says afterwards is collected.
     fn start(command: &mut Command, has_panel: bool) -> Running {
         let piped = command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::null());
-        let mut child = piped.spawn().expect("it starts");
+        Running::of(piped.spawn().expect("it starts"), has_panel)
+    }
+
+    fn of(mut child: Child, has_panel: bool) -> Running {
         let mut lines = BufReader::new(child.stdout.take().expect("piped"));
         let mut link = String::new();
         while has_panel && !link.starts_with("panel  ") {
@@ -316,4 +322,131 @@ fn a_rig_on_another_computer_is_operated_through_ssh() {
     assert_eq!(output.status.code(), Some(1));
     let told = String::from_utf8_lossy(&output.stderr);
     assert!(told.contains("no rig runs in") && told.contains("anna@rig feeds no panel"), "{told}");
+}
+
+/// Texts that are no commands, or none everywhere: parts of commands in any order.
+fn refused_lines(seed: u64) -> Vec<String> {
+    const PARTS: &[&str] = &[
+        "enable",
+        "arm",
+        "stop",
+        "again",
+        "reset",
+        "set",
+        "set ",
+        "mark",
+        "show",
+        "help",
+        "take",
+        "refuse",
+        " ",
+        " now",
+        "=",
+        ",",
+        "fr.Fs",
+        "fr.Fs = 0.4 N·m",
+        "STOP",
+        "stpo",
+        "halt",
+        "@1",
+        "-",
+        "\u{202e}",
+        "\u{7}",
+        "µ",
+        "9",
+    ];
+    let mut chance = runtime::rng::Chance(seed);
+    let mut all = Vec::new();
+    while all.len() < 40 {
+        let parts = (0..1 + chance.below(4)).map(|_| PARTS[chance.below(PARTS.len() as u64) as usize]);
+        let text = parts.collect::<String>().trim().to_string();
+        let refused = |door| Line::read(&text).and_then(|line| line.at(door)).is_err();
+        if !text.is_empty() && [Door::Prompt, Door::Say, Door::Page].into_iter().all(refused) && !all.contains(&text) {
+            all.push(text);
+        }
+    }
+    all
+}
+
+/// Sets that are lines, but that a start would refuse.
+const REFUSED_SETS: &[&str] = &[
+    "set fr.Fs = -1 N·m",
+    "set fr.Fs = 0.1 N·m",
+    "set fr.Fs = 1 s",
+    "set fr.Fs = 0.5",
+    "set fr.Fs = much",
+    "set fr.Fs = 0.5 furlong",
+    "set fr.Fx = 0.5 N·m",
+    "set fr.Fc = 0.3 N·m",
+    "set fr.vs = 0 rad/s",
+    "set fr.vs = 0.02 rad/s, fr.vs = 0.03 rad/s",
+    "set fr.vs = 0.02 rad/s, pid.Ts = 15 ms",
+];
+
+/// The same text at the prompt of `fric hil`, by `fric-rig say` and from a page, of the same rig: the same answer. `FRIC_SEED`
+/// gives other texts.
+#[test]
+fn every_door_gives_the_same_answer_to_the_same_text() {
+    let seed = std::env::var("FRIC_SEED").ok().and_then(|text| text.parse().ok()).unwrap_or(5);
+    let mut texts = refused_lines(seed);
+    texts.extend(REFUSED_SETS.iter().map(|text| text.to_string()));
+    let folder = packed("doors");
+
+    let mut hil = fric();
+    hil.current_dir(&folder).args(["hil", "slow.fric", "--sim", "--panel", "--no-open", "--port", "0", "--log", "hil"]);
+    let piped = hil.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped());
+    let mut hil = Running::of(piped.spawn().expect("it starts"), true);
+    let page = browser().page(&hil.link);
+    sentence(&page, "armed");
+    page.value(CLIENT);
+    let asked = |text: &str| {
+        let told = page.value(&format!("client.ask({}, true).then(answer => answer[1])", json!(text)));
+        told.as_str().unwrap_or_else(|| panic!("{text:?}: {told}")).to_string()
+    };
+    let by_page: Vec<String> = texts.iter().map(|text| asked(text)).collect();
+    let mut prompt = hil.child.stdin.take().expect("piped");
+    // The panel has the same standard error and stays as long as its page: it is read by lines.
+    let (told, errors) = (Arc::new(Mutex::new(String::new())), BufReader::new(hil.child.stderr.take().expect("piped")));
+    let all = told.clone();
+    std::thread::spawn(move || {
+        errors.lines().map_while(Result::ok).for_each(|line| *all.lock().unwrap() += &format!("{line}\n"));
+    });
+    texts.iter().for_each(|text| writeln!(prompt, "{text}").expect("it reads"));
+    writeln!(prompt, "stop").expect("it reads");
+    sentence(&page, "ended as asked");
+    std::thread::sleep(Duration::from_millis(300));
+    writeln!(prompt, "quit").expect("it reads");
+    assert_eq!(hil.code(), 0, "{}", told.lock().unwrap());
+    std::thread::sleep(Duration::from_millis(300));
+    let told = told.lock().unwrap().clone();
+    let by_prompt: Vec<&str> = told.lines().filter(|line| line.contains(" is refused: ")).collect();
+    // What the page says is printed there too.
+    let own = by_prompt.len().checked_sub(texts.len()).unwrap_or_else(|| panic!("{told}"));
+    let by_prompt = &by_prompt[own..];
+
+    let running = Running::start(&mut rig(&folder, &["--sim", "--panel", "--port", "0"]), true);
+    // Before that a set is refused because of the phase.
+    sentence(&browser().page(&running.link), "armed");
+    for ((text, by_page), by_prompt) in texts.iter().zip(&by_page).zip(by_prompt) {
+        let mut say = Command::new(&*FRIC_RIG);
+        let said = say.current_dir(&folder).args(["say", "--dir", "there", "--", text]).output().unwrap();
+        let by_say = String::from_utf8_lossy(&said.stderr).trim().to_string();
+        let begin = format!("error: `{text}` is refused: ");
+        let why = by_prompt.strip_prefix(&begin).unwrap_or_else(|| panic!("{text:?}: {by_prompt}"));
+        let read = |door| Line::read(text).and_then(|line| line.at(door));
+        match read(Door::Prompt) {
+            // Where a line has a meaning elsewhere only, each door says so for itself.
+            Err(_) => {
+                assert_eq!(read(Door::Prompt).err().as_deref(), Some(why), "{text:?}");
+                assert_eq!(read(Door::Page).err(), Some(by_page.clone()), "{text:?}");
+                let reason = read(Door::Say).expect_err("it is refused everywhere");
+                assert!(by_say.ends_with(&format!("is refused: {reason}")), "{text:?}: {by_say}");
+                assert_eq!(said.status.code(), Some(if Line::read(text).is_err() { 2 } else { 1 }), "{text:?}");
+            }
+            Ok(_) => {
+                assert!(!why.is_empty() && by_page == why, "{text:?}: {by_page} {why}");
+                assert_eq!((by_say, said.status.code()), (format!("{begin}{why}"), Some(1)));
+            }
+        }
+    }
 }

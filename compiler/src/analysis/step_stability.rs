@@ -27,6 +27,7 @@ use abi::plan::Method;
 use std::cell::{OnceCell, RefCell};
 use std::ops::ControlFlow;
 use std::rc::Rc;
+use std::sync::Arc;
 
 /// Limit on the number of divisors of the shortest period that are tried for a step that divides the others as well.
 const MOST_PARTS: u32 = 1000;
@@ -110,12 +111,7 @@ pub struct Singular {
 /// Evaluates a program at points of its ranges.
 pub struct Bench<'a> {
     program: &'a Program,
-    outputs: Func,
-    derivatives: Func,
-    /// ∂f/∂x, row-major, stored after the block.
-    jacobian: Func,
-    /// A step of `expo` for the states only.
-    relaxing: Func,
+    code: Arc<Code>,
     /// Slots that are not 0 where the run would have ended, without those of conditions that hold at the start already,
     /// such as an enabling switch at 0: they would exclude every point.
     ends: Vec<Slot>,
@@ -128,9 +124,36 @@ pub struct Bench<'a> {
     steps: RefCell<HashMap<u8, Rc<Func>>>,
 }
 
+/// What is evaluated at each point. It does not depend on the values of parameters.
+struct Code {
+    outputs: Func,
+    derivatives: Func,
+    /// ∂f/∂x, row-major, stored after the block.
+    jacobian: Func,
+    /// A step of `expo` for the states only.
+    relaxing: Func,
+}
+
+impl Code {
+    fn of(program: &Program) -> Arc<Code> {
+        static KNOWN: Memo<Arc<Code>> = Memo::new();
+        let layout = &program.description.layout;
+        KNOWN.of_functions(program, &[], || {
+            let rows: Vec<Slot> = layout.derivatives.range().map(|slot| Slot(slot as u32)).collect();
+            Arc::new(Code {
+                outputs: expand(&program.outputs),
+                derivatives: expand(&program.derivatives),
+                jacobian: derivative(program, &program.derivatives, &rows),
+                relaxing: expand(&fixed_step::advance(program, Method::Expo)),
+            })
+        })
+    }
+}
+
 /// The derivative of a method's fixed step with respect to the states.
+#[derive(Clone)]
 struct Stepper {
-    derivative: Func,
+    derivative: Arc<Func>,
 }
 
 /// A quantity to vary: its slot, its values by magnitude, and whether its range is bounded.
@@ -197,16 +220,12 @@ impl<'a> Bench<'a> {
             base[input.slot.index()] = resting(input.range);
         }
         run_once(&start, &mut base, &program.description.pool);
-        let rows: Vec<Slot> = (0..n).map(|k| layout.derivatives.slot(k)).collect();
-        let outputs = expand(&program.outputs);
+        let code = Code::of(program);
         let mut at_rest = base.clone();
-        run_once(&outputs, &mut at_rest, &program.description.pool);
+        run_once(&code.outputs, &mut at_rest, &program.description.pool);
         Some(Bench {
             program,
-            outputs,
-            derivatives: expand(&program.derivatives),
-            jacobian: derivative(program, &program.derivatives, &rows),
-            relaxing: expand(&fixed_step::advance(program, Method::Expo)),
+            code,
             ends: ends.iter().copied().filter(|slot| at_rest[slot.index()] == 0.0).collect(),
             n,
             base,
@@ -220,9 +239,13 @@ impl<'a> Bench<'a> {
     }
 
     fn stepper(&self, method: Method) -> Stepper {
+        static KNOWN: Memo<Stepper> = Memo::new();
         let layout = &self.program.description.layout;
-        let rows: Vec<Slot> = (0..self.n).map(|k| layout.states.slot(k)).collect();
-        Stepper { derivative: derivative(self.program, &fixed_step::advance(self.program, method), &rows) }
+        KNOWN.of_functions(self.program, &[method as u64], || {
+            let rows: Vec<Slot> = (0..self.n).map(|k| layout.states.slot(k)).collect();
+            let derivative = derivative(self.program, &fixed_step::advance(self.program, method), &rows);
+            Stepper { derivative: Arc::new(derivative) }
+        })
     }
 
     /// The quantities to vary: inputs and states, by powers of ten and to the ends of their ranges.
@@ -271,7 +294,7 @@ impl<'a> Bench<'a> {
             return false;
         }
         let mut block = block.to_vec();
-        run_once(&self.outputs, &mut block, &self.program.description.pool);
+        run_once(&self.code.outputs, &mut block, &self.program.description.pool);
         self.ends.iter().any(|slot| block[slot.index()] != 0.0)
     }
 
@@ -291,7 +314,7 @@ impl<'a> Bench<'a> {
         let (growth, power) = radius(&step, n, 1.0 + 2.0 * MARGIN)?;
         // An unstable model may grow, but the step by no more than twice the model's own rate; otherwise the falling
         // branch of a Stribeck curve would mask the instability of a bristle.
-        let model = self.matrix(&self.jacobian, block, h);
+        let model = self.matrix(&self.code.jacobian, block, h);
         if let Some((own, _)) = radius(&exponential(&model, n, h), n, 1.0 + MARGIN)
             && (own.is_nan() || growth - 1.0 <= 2.0 * (own - 1.0) + 2.0 * MARGIN)
         {
@@ -307,7 +330,7 @@ impl<'a> Bench<'a> {
     fn scanned(&self) -> &[Scanned] {
         self.scanned.get_or_init(|| {
             let settings = self.settings();
-            let mut left = WORK / (RELAXING.0 * self.relaxing.ops.len() + self.outputs.ops.len()).max(1);
+            let mut left = WORK / (RELAXING.0 * self.code.relaxing.ops.len() + self.code.outputs.ops.len()).max(1);
             let one = |scan: Scan| {
                 let (mut closed, mut farthest, mut points) = (scan.closed, 0.0_f64, Vec::new());
                 for (setting, start) in settings.iter().enumerate() {
@@ -412,8 +435,10 @@ impl<'a> Bench<'a> {
     /// curve, the speeds at which it falls.
     pub fn singular(&self, h: f64) -> Option<Singular> {
         let (limit, n) = (0.75 / (fixed_step::GAMMA * h), self.n);
-        let cost =
-            RELAXING.0 * self.relaxing.ops.len() + self.jacobian.ops.len() + self.outputs.ops.len() + 20 * n.pow(3);
+        let cost = RELAXING.0 * self.code.relaxing.ops.len()
+            + self.code.jacobian.ops.len()
+            + self.code.outputs.ops.len()
+            + 20 * n.pow(3);
         let mut work = WORK / cost;
         let mut worst: Option<Singular> = None;
         for scan in self.scans() {
@@ -428,7 +453,7 @@ impl<'a> Bench<'a> {
                 if self.ended(&block) {
                     continue;
                 }
-                let model = self.matrix(&self.jacobian, &self.relaxed_around(block, scan.slot), h);
+                let model = self.matrix(&self.code.jacobian, &self.relaxed_around(block, scan.slot), h);
                 let Some((growth, _)) = radius(&exponential(&model, n, h), n, exp(limit * h)) else { continue };
                 let rate = ln(growth) / h;
                 if rate.is_finite() && worst.as_ref().is_none_or(|worst| rate > worst.rate) {
@@ -463,7 +488,7 @@ impl<'a> Bench<'a> {
         let begin = block.clone();
         block[Slot::STEP.index()] = RELAXING.1;
         for _ in 0..RELAXING.0 {
-            run_once(&self.relaxing, &mut block, &self.program.description.pool);
+            run_once(&self.code.relaxing, &mut block, &self.program.description.pool);
         }
         let states = self.program.description.layout.states.range();
         if block[states].iter().all(|x| x.is_finite()) { block } else { begin }
@@ -475,7 +500,7 @@ impl<'a> Bench<'a> {
         let (begin, value) = (block.clone(), block[held.index()]);
         block[Slot::STEP.index()] = RELAXING.1;
         for _ in 0..RELAXING.0 {
-            run_once(&self.relaxing, &mut block, &self.program.description.pool);
+            run_once(&self.code.relaxing, &mut block, &self.program.description.pool);
             block[held.index()] = value;
         }
         let states = self.program.description.layout.states.range();
@@ -483,15 +508,15 @@ impl<'a> Bench<'a> {
     }
 
     fn rate(&self, block: &[f64], state: usize) -> f64 {
-        -self.matrix(&self.jacobian, block, 0.0)[state * self.n + state]
+        -self.matrix(&self.code.jacobian, block, 0.0)[state * self.n + state]
     }
 
     /// Operations for one point.
     fn cost(&self, stepper: &Stepper) -> usize {
-        RELAXING.0 * self.relaxing.ops.len()
+        RELAXING.0 * self.code.relaxing.ops.len()
             + stepper.derivative.ops.len()
-            + self.jacobian.ops.len()
-            + self.outputs.ops.len()
+            + self.code.jacobian.ops.len()
+            + self.code.outputs.ops.len()
             + 40 * self.n.pow(3)
     }
 
@@ -639,7 +664,7 @@ impl<'a> Bench<'a> {
             let (state, rate) = (layout.states.slot(k), layout.derivatives.slot(k));
             let rate_at = |x: f64| {
                 let mut block = self.at(&self.base, state, x);
-                run_once(&self.derivatives, &mut block, &self.program.description.pool);
+                run_once(&self.code.derivatives, &mut block, &self.program.description.pool);
                 block[rate.index()]
             };
             let (plus, minus) = (rate_at(1e-12), rate_at(-1e-12));

@@ -637,6 +637,21 @@ impl PartitionedRig {
         control: &Program,
         files: &Files,
     ) -> Vec<Diagnostic> {
+        let mut found = self.stability((system, types), rig, control, files);
+        found.extend(crate::analysis::acting_mass::check(system, types, control, rig.plant.inertia, self.places.run));
+        found.retain(|said| said.is_error() || !self.allowed(said));
+        found
+    }
+
+    /// Errors and warnings about the stability of the steps of the control program, whose parameters may have other
+    /// values than those of the system.
+    pub fn stability(
+        &self,
+        (system, types): (&System, &Types),
+        rig: &Rig,
+        control: &Program,
+        files: &Files,
+    ) -> Vec<Diagnostic> {
         let ends: Vec<(ExprId, Slot)> =
             self.stops.iter().zip(&rig.stops).map(|(condition, stop)| (*condition, stop.slot)).collect();
         let fixed = step_stability_report::Fixed {
@@ -651,10 +666,7 @@ impl PartitionedRig {
             by: StepBy::Rate,
             name: &rig.name,
         };
-        let mut found = step_stability_report::check(&fixed, files);
-        found.extend(crate::analysis::acting_mass::check(system, types, control, rig.plant.inertia, fixed.run));
-        found.retain(|said| said.is_error() || !self.allowed(said));
-        found
+        step_stability_report::check(&fixed, files)
     }
 
     fn allowed(&self, warning: &Diagnostic) -> bool {
