@@ -146,6 +146,26 @@ fn contrast_is_enough_in_light_and_dark() {
     assert_ne!(faint(&page), json!([]));
 }
 
+#[test]
+fn forced_colours_show_text_curves_and_what_is_pressed() {
+    let panel = Panel::open(&[STICK_SLIP]);
+    let page = open(&panel);
+    page.media("forced-colors", "active");
+    page.wait("matchMedia('(forced-colors: active)').matches");
+    page.key("ArrowRight");
+    page.value("new Promise(done => requestAnimationFrame(() => setTimeout(() => done(true), 200)))");
+    page.shot("what-if-forced");
+    assert_eq!(faint(&page), json!([]));
+    // What is pressed is known by more than a colour that is no longer there.
+    let widths = page.value(
+        "[true, false].map(on => [...document.querySelectorAll(`button[aria-pressed=\"${on}\"]`)]
+         .filter(e => e.checkVisibility()).map(e => getComputedStyle(e).borderTopWidth))",
+    );
+    let [pressed, others] = [&widths[0], &widths[1]].map(|all| all.as_array().expect("a list").clone());
+    assert!(!others.is_empty() && others.iter().all(|width| *width == "1px"), "{widths}");
+    assert!(!pressed.is_empty() && pressed.iter().all(|width| *width == "3px"), "{widths}");
+}
+
 /// Targets that are not large enough for a thumb.
 fn small(page: &Page) -> Value {
     page.value(
