@@ -243,46 +243,72 @@ fn guests_look_and_may_stop_and_no_more() {
 
 /// Whatever comes before the right key: whole frames of every kind, broken ones, and bytes that are no frames. None of
 /// it is obeyed, the stranger receives no data, and the panel continues to serve.
+/// Frames of the protocol and what is nearly such: final or not, with or without reserved bits, any opcode, masked or not,
+/// and any length.
+fn frames(seed: u64) -> Vec<u8> {
+    let mut state = seed;
+    let mut below = |n: u64| {
+        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        (state >> 33) % n
+    };
+    let mut bytes = Vec::new();
+    for _ in 0..1 + below(4) {
+        let text: &[u8] = match below(4) {
+            0 => b"1 yes",
+            1 => b"view 0 0 all 10",
+            2 => b"key 00000000000000000000000000000000",
+            _ => b"ack 1",
+        };
+        let (first, masked) = ((below(256) as u8) & if below(2) == 0 { 0xff } else { 0x81 }, below(8) > 0);
+        let length = if below(4) == 0 { below(126) as u8 } else { text.len() as u8 };
+        bytes.extend([first, length | if masked { 0x80 } else { 0 }]);
+        if masked {
+            bytes.extend([0; 4]);
+        }
+        bytes.extend(text);
+        if below(3) == 0 {
+            bytes.push(below(256) as u8);
+        }
+    }
+    bytes
+}
+
+/// Sends bytes and no more; returns everything that comes back.
+fn answer_to(socket: &mut WebSocket<TcpStream>, bytes: &[u8]) -> String {
+    let stream = socket.get_mut();
+    let _ = stream.write_all(bytes);
+    let _ = stream.shutdown(Shutdown::Write);
+    let mut told = Vec::new();
+    let _ = stream.read_to_end(&mut told);
+    String::from_utf8_lossy(&told).into_owned()
+}
+
 #[test]
 fn nothing_before_the_key_is_obeyed() {
     let open = open();
-    for seed in 1..=80_u64 {
-        let mut state = seed;
-        let mut below = |n: u64| {
-            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-            (state >> 33) % n
-        };
-        let mut socket = open.socket("");
-        let mut bytes = Vec::new();
-        for _ in 0..1 + below(4) {
-            let text: &[u8] = match below(4) {
-                0 => b"1 yes",
-                1 => b"view 0 0 all 10",
-                2 => b"key 00000000000000000000000000000000",
-                _ => b"ack 1",
-            };
-            // Final or not, with or without reserved bits, any opcode, masked or not, and any length.
-            let (first, masked) = ((below(256) as u8) & if below(2) == 0 { 0xff } else { 0x81 }, below(8) > 0);
-            let length = if below(4) == 0 { below(126) as u8 } else { text.len() as u8 };
-            bytes.extend([first, length | if masked { 0x80 } else { 0 }]);
-            if masked {
-                bytes.extend([0; 4]);
-            }
-            bytes.extend(text);
-            if below(3) == 0 {
-                bytes.push(below(256) as u8);
-            }
-        }
-        let stream = socket.get_mut();
-        let _ = stream.write_all(&bytes);
-        let _ = stream.shutdown(Shutdown::Write);
-        let mut told = Vec::new();
-        let _ = stream.read_to_end(&mut told);
-        let told = String::from_utf8_lossy(&told);
+    for seed in 1..=80 {
+        let told = answer_to(&mut open.socket(""), &frames(seed));
         assert!(!told.contains("hello") && !told.contains("state") && !told.contains("answer"), "seed {seed}: {told}");
         assert_eq!(*open.subject.said.lock().unwrap(), [""; 0], "seed {seed}");
     }
     open.viewer();
+}
+
+/// A viewer that sends anything ends its own connection at most.
+#[test]
+fn no_bytes_end_the_server() {
+    let open = open();
+    let mut watching = open.viewer();
+    let mut obeyed = 0;
+    for seed in 1..=200 {
+        answer_to(&mut open.viewer(), &frames(seed));
+        obeyed += open.subject.said.lock().unwrap().drain(..).filter(|words| words == "yes").count();
+        if seed % 20 == 0 {
+            watching.send(Message::text(format!("{seed} yes"))).expect("it is connected");
+            assert_eq!(text(&mut watching), format!(r#"{{"kind":"answer","number":{seed},"ok":"yes"}}"#));
+        }
+    }
+    assert!(obeyed > 10, "{obeyed} of the frames are lines");
 }
 
 #[test]
