@@ -258,6 +258,8 @@ fn the_rig_does_not_notice_the_end_of_its_panel_and_the_page_notices_that_of_the
     let _ = rig.child.kill();
     let begun = Instant::now();
     sentence(&page, "the process of the rig was killed");
+    // 2 s are wanted; the bound is for machines that do something else.
+    println!("the end of the rig is on the page after {:?}", begun.elapsed());
     assert!(begun.elapsed() < Duration::from_secs(10), "{:?}", begun.elapsed());
     // The panel stays as long as a page shows it, and then ends by itself.
     drop(page);
