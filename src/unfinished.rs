@@ -5,6 +5,7 @@
 //! `.NAME.unfinished`, with the request, an empty line, and checkpoints: rows, bytes and a hash of all bytes so far.
 //! The operating system releases the lock however the process ends. Knows nothing of the meaning of rows.
 
+use crate::compile::Loaded;
 use runtime::record::claim::open_alone;
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, BufRead, BufReader, Read, Seek, SeekFrom, Write};
@@ -21,6 +22,17 @@ impl Hash {
     /// The hash after these further bytes.
     pub fn and(self, bytes: &[u8]) -> Hash {
         Hash(bytes.iter().fold(self.0, |hash, byte| (hash ^ u64::from(*byte)).wrapping_mul(0x0100_0000_01b3)))
+    }
+
+    /// The hash of these numbers, by their bits.
+    pub fn of_numbers<'a>(numbers: impl IntoIterator<Item = &'a f64>) -> Hash {
+        numbers.into_iter().fold(Hash::EMPTY, |hash, number| hash.and(&number.to_bits().to_le_bytes()))
+    }
+
+    /// The hash of all texts of files, library included; options are none.
+    pub fn of_texts(loaded: &Loaded) -> Hash {
+        let texts = loaded.files.0.iter().filter(|file| !file.name.starts_with("--"));
+        texts.fold(Hash::EMPTY, |hash, file| hash.and(file.text.as_bytes()))
     }
 }
 
@@ -39,6 +51,26 @@ pub struct Mark {
     pub bytes: u64,
     /// Hash of these bytes.
     pub hash: Hash,
+}
+
+impl Mark {
+    /// After the header.
+    pub fn after(header: &[u8]) -> Mark {
+        Mark { rows: 0, bytes: header.len() as u64, hash: Hash::EMPTY.and(header) }
+    }
+
+    /// After one more row, with its end of line.
+    pub fn and(self, row: &[u8]) -> Mark {
+        Mark { rows: self.rows + 1, bytes: self.bytes + row.len() as u64, hash: self.hash.and(row) }
+    }
+}
+
+/// Says that a table was begun with another request: `earlier`, and now `asked`. `other` names what differs, `remedy` what
+/// to do instead of giving the same.
+pub fn begun_otherwise(table: &Path, other: &str, (earlier, asked): (&str, &str), remedy: &str) -> String {
+    let indented = |text: &str| text.lines().map(|line| format!("  {line}\n")).collect::<String>();
+    let (table, earlier, asked) = (table.display(), indented(earlier), indented(asked));
+    format!("{table} was begun with {other}:\n{earlier}now:\n{asked}give the same, or {remedy}")
 }
 
 /// Exclusive write access to a table.
@@ -127,7 +159,7 @@ impl Unfinished {
             let fault = (reader.get_ref().metadata()?.len() >= header.len() as u64).then(|| "its header".to_string());
             return Ok(Sound { mark: nothing, fault });
         }
-        let start = Mark { rows: 0, bytes: header.len() as u64, hash: Hash::EMPTY.and(header) };
+        let start = Mark::after(header);
         let (mut at, mut good, mut fault, mut line) = (start, start, None, Vec::new());
         let mut marks = self.marks.iter().filter(|mark| mark.bytes > start.bytes).peekable();
         loop {
@@ -139,7 +171,7 @@ impl Unfinished {
                 fault = Some(format!("row {}", at.rows));
                 break;
             }
-            at = Mark { rows: at.rows + 1, bytes: at.bytes + line.len() as u64, hash: at.hash.and(&line) };
+            at = at.and(&line);
             match marks.peek() {
                 Some(mark) if **mark == at => good = *marks.next().expect("it was looked at"),
                 Some(mark) if mark.bytes <= at.bytes => {

@@ -1,7 +1,7 @@
 //! Columns for libraries that read the Arrow C stream interface, such as pyarrow, polars and DuckDB; numbers without a copy.
 //!
-//! In: names, and arrays of NumPy or lists of words and truth values. Out: a capsule `arrow_array_stream` with one batch. Source: the Arrow C data interface
-//! and the Arrow PyCapsule interface (arrow.apache.org/docs/format).
+//! In: names, and arrays of NumPy or lists of words and truth values. Out: a capsule `arrow_array_stream` with one batch.
+//! Source: the Arrow C data interface and the Arrow PyCapsule interface (arrow.apache.org/docs/format).
 
 use numpy::{PyArray1, PyArrayMethods, PyUntypedArrayMethods};
 use pyo3::exceptions::PyValueError;

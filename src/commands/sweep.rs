@@ -800,8 +800,8 @@ impl SweepTable {
         Ok(End::Fine)
     }
 
-    /// Whether a line can be a block of runs; or a line of the table the row of a run: its number, the varied values, the number of columns, and
-    /// numbers in the columns of measures.
+    /// Whether a line can be what was kept under this number: a block of runs, or the row of a run, with the number, the
+    /// varied values, the number of columns, and numbers in the columns of measures.
     fn is_row(&self, run: u64, row: &str, dice: &Dice) -> bool {
         if let Some(cut) = self.cut() {
             return statistics::is_block(self, cut, run, row);
@@ -885,9 +885,7 @@ impl SweepTable {
 
     /// The request that a sweep must share with one that it resumes.
     fn asked(&self, loaded: &Loaded, range: &Range<u64>) -> String {
-        let texts = loaded.files.0.iter().filter(|file| !file.name.starts_with("--"));
-        let texts = texts.fold(Hash::EMPTY, |hash, file| hash.and(file.text.as_bytes()));
-        let mut asked = format!("fric {}, texts {texts:016x}\n", env!("CARGO_PKG_VERSION"));
+        let mut asked = format!("fric {}, texts {:016x}\n", env!("CARGO_PKG_VERSION"), Hash::of_texts(loaded));
         let solver = results::solver(&self.cases[0].experiment.solver);
         asked += &format!("{} with {solver} for {} s\n", self.request.experiment, self.cases[0].experiment.duration);
         for vary in self.request.vary.iter().filter(|vary| matches!(vary.how, How::Models(_))) {
@@ -899,8 +897,7 @@ impl SweepTable {
         for vary in &self.vary {
             let how = match &vary.how {
                 How::Design(values) => {
-                    let hash = values.iter().fold(Hash::EMPTY, |hash, value| hash.and(&value.to_bits().to_le_bytes()));
-                    format!("a design of {} rows, {hash:016x}", values.len())
+                    format!("a design of {} rows, {:016x}", values.len(), Hash::of_numbers(values))
                 }
                 How::Values(values) => {
                     format!("{} values, {:?} .. {:?}", values.len(), values[0], values[values.len() - 1])

@@ -7,7 +7,7 @@ use crate::args;
 use crate::compile::{self, Loaded};
 use crate::project;
 use crate::terminal::Terminal;
-use crate::unfinished::{Hash, Mark, Unfinished};
+use crate::unfinished::{Hash, Mark, Unfinished, begun_otherwise};
 use runtime::fit::{Journal, Stage};
 use std::cell::RefCell;
 use std::collections::VecDeque;
@@ -68,14 +68,11 @@ impl<'a> Keeping<'a> {
 
 /// What a fit must share with one that it resumes.
 fn asked(args: &args::Fit, loaded: &Loaded, name: &str, compiled: &[compile::Fit]) -> String {
-    let texts = loaded.files.0.iter().filter(|file| !file.name.starts_with("--"));
-    let texts = texts.fold(Hash::EMPTY, |hash, file| hash.and(file.text.as_bytes()));
     let judged = compiled.iter().flat_map(|fit| &fit.judged);
     let asks = compiled.iter().chain(judged).flat_map(|fit| &fit.parts).map(|part| &part.asks);
     let columns = asks.flat_map(|asks| asks.columns.iter().map(|(_, _, values)| values).chain([&asks.rows]));
-    let recordings = columns.flatten().fold(Hash::EMPTY, |hash, value| hash.and(&value.to_bits().to_le_bytes()));
-    let mut asked = format!("fric {}, texts {texts:016x}\n", env!("CARGO_PKG_VERSION"));
-    let _ = writeln!(asked, "fit {name}, recordings {recordings:016x}");
+    let mut asked = format!("fric {}, texts {:016x}\n", env!("CARGO_PKG_VERSION"), Hash::of_texts(loaded));
+    let _ = writeln!(asked, "fit {name}, recordings {:016x}", Hash::of_numbers(columns.flatten()));
     for set in args.stepped.set.texts() {
         let _ = writeln!(asked, "--set {set}");
     }
@@ -126,16 +123,11 @@ impl Kept {
             let unfinished = Some(unfinished);
             Ok(Some(Kept(Rc::new(RefCell::new(Stages { path, unfinished, file, mark, earlier, fault: None })))))
         };
-        let start = Mark { rows: 0, bytes: HEADER.len() as u64, hash: Hash::EMPTY.and(HEADER) };
+        let start = Mark::after(HEADER);
         let before = unfinished.before().map(str::to_string).filter(|_| resume);
         if let Some(before) = &before {
             if before != asked.trim_end() {
-                return Err(format!(
-                    "{} was begun with another question:\n{}now:\n{}give the same, or leave --resume out",
-                    path.display(),
-                    indented(before),
-                    indented(asked)
-                ));
+                return Err(begun_otherwise(path, "another question", (before, asked), "leave --resume out"));
             }
             let sound = unfinished.sound(path, HEADER, &|_, line| stage(line).is_some()).map_err(told)?;
             if let Some(fault) = &sound.fault {
@@ -176,8 +168,7 @@ impl Journal for Kept {
         let stages = &mut *self.0.borrow_mut();
         let Some(unfinished) = stages.unfinished.as_mut().filter(|_| stages.fault.is_none()) else { return };
         let line = line(stage);
-        let Mark { rows, bytes, hash } = stages.mark;
-        stages.mark = Mark { rows: rows + 1, bytes: bytes + line.len() as u64, hash: hash.and(line.as_bytes()) };
+        stages.mark = stages.mark.and(line.as_bytes());
         let written = stages.file.write_all(line.as_bytes()).and_then(|()| unfinished.note(stages.mark));
         stages.fault = written.err();
     }
@@ -195,8 +186,4 @@ fn stage(line: &str) -> Option<Stage> {
     let mut parts = line.split('\t');
     let numbers = parts.next()?.split(' ').map(|bits| Some(f64::from_bits(u64::from_str_radix(bits, 16).ok()?)));
     Some(Stage { numbers: numbers.collect::<Option<_>>()?, words: parts.map(str::to_string).collect() })
-}
-
-fn indented(text: &str) -> String {
-    text.lines().map(|line| format!("  {line}\n")).collect()
 }

@@ -43,7 +43,7 @@ pub struct Runs {
     pub name: Span,
     /// Lints that the fit allows.
     pub allowed: Vec<String>,
-    /// Where the stages of its searches are kept.
+    /// The file that keeps the stages of the searches, for `--resume`.
     pub kept: Option<Kept>,
 }
 

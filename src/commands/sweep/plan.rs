@@ -122,7 +122,7 @@ pub fn read(bytes: &[u8]) -> Result<Plan, Unusable> {
                 interpret: false,
             },
             text: SentText { name: text("name")?, text: text("text")?, files: files.collect::<Option<_>>()? },
-            hash: abi::image::sha256(bytes).iter().map(|byte| format!("{byte:02x}")).collect(),
+            hash: runtime::package::hash(bytes),
         })
     };
     plan().ok_or(Unusable::NotWhole)

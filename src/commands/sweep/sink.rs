@@ -1,15 +1,16 @@
 //! Where the rows of a sweep go: a table, or a dataset, a folder of Parquet files.
 //!
-//! In: rows in the order of the runs, or blocks of runs for statistics. Out: files that are whole or marked as unfinished, with where to go on after an
-//! interruption. A table grows row by row. The files of a dataset are cut by the number of runs alone, so the bytes of
-//! each depend on its runs and not on who made it or when; each is written whole or not at all.
+//! In: rows in the order of the runs, or blocks of runs for statistics. Out: files that are whole or marked as unfinished,
+//! with where to go on after an interruption. A table grows row by row. The files of a dataset are cut by the number of runs
+//! alone, so the bytes of each depend on its runs and not on who made it or when; each is written whole or not at all.
 
 use super::SweepTable;
 use super::statistics::Statistics;
 use super::summary::Summary;
 use crate::parquet;
 use crate::project;
-use crate::unfinished::{Hash, Mark, Unfinished};
+use crate::unfinished::{Mark, Unfinished, begun_otherwise};
+use runtime::package::hash;
 use serde_json::json;
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, BufRead, BufReader, BufWriter, Write};
@@ -47,10 +48,6 @@ fn name_of(path: &Path) -> String {
     path.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default()
 }
 
-fn indented(text: &str) -> String {
-    text.lines().map(|line| format!("  {line}\n")).collect()
-}
-
 /// Whether a name is that of a dataset: it has no ending, or ends with `/`.
 pub fn is_dataset(out: &Path) -> bool {
     out.extension().is_none()
@@ -67,16 +64,12 @@ fn part(folder: &Path, first: u64) -> PathBuf {
     folder.join(format!("part-{first:08}.parquet"))
 }
 
-/// Writes the file of a dataset with these rows, whole or not at all: the SHA-256 of its bytes, in hexadecimal.
+/// Writes these rows as the file of a dataset, whole or not at all. Returns the SHA-256 of its bytes, in hexadecimal.
 pub fn write_part(table: &SweepTable, folder: &Path, first: u64, rows: &[u8]) -> io::Result<String> {
     let mut bytes = Vec::new();
     parquet::from_csv(rows, false, &table.kinds(), &mut bytes)?;
     project::write(&part(folder, first), &bytes)?;
-    Ok(hash_of(&bytes))
-}
-
-fn hash_of(bytes: &[u8]) -> String {
-    abi::image::sha256(bytes).iter().map(|byte| format!("{byte:02x}")).collect()
+    Ok(hash(&bytes))
 }
 
 /// The file that tells what a dataset is.
@@ -172,12 +165,8 @@ impl Sink {
         let is_same = earlier.as_deref().is_some_and(|earlier| earlier == asked.trim_end());
         match (before, &earlier) {
             (Before::Continue, Some(earlier)) if !is_same => {
-                return Err(format!(
-                    "{} was begun with other settings or another text:\n{}now:\n{}give the same, or remove it",
-                    out.display(),
-                    indented(earlier),
-                    indented(&asked)
-                ));
+                let both = (earlier.as_str(), asked.as_str());
+                return Err(begun_otherwise(out, "other settings or another text", both, "remove it"));
             }
             (Before::Continue, None) if locked.exists() => {
                 return Err(format!("{} is complete or was not made by a sweep: nothing to resume", out.display()));
@@ -232,7 +221,7 @@ impl Sink {
             sink.unfinished.begin(&sink.asked)?;
             let mut writer = BufWriter::new(File::create(&rows)?);
             writer.write_all(&header)?;
-            let mark = Mark { rows: 0, bytes: header.len() as u64, hash: Hash::EMPTY.and(&header) };
+            let mark = Mark::after(&header);
             sink.form = Form::Table { writer, mark };
             Ok(())
         };
@@ -278,8 +267,7 @@ impl Sink {
         match &mut self.form {
             Form::Table { writer, mark } => {
                 writer.write_all(row)?;
-                let Mark { rows, bytes, hash } = *mark;
-                *mark = Mark { rows: rows + 1, bytes: bytes + row.len() as u64, hash: hash.and(row) };
+                *mark = mark.and(row);
                 if is_late {
                     writer.flush()?;
                     self.unfinished.note(*mark)?;
@@ -304,7 +292,7 @@ impl Sink {
     ///
     /// # Errors
     /// If it is not there as it was written, in words.
-    pub fn adopt(&mut self, hash: &str) -> Result<(), String> {
+    pub fn adopt(&mut self, expected: &str) -> Result<(), String> {
         let Form::Dataset { each, .. } = self.form else {
             return Err(format!("{} is no dataset, whose files others may write", self.out.display()));
         };
@@ -315,7 +303,7 @@ impl Sink {
                 path.display()
             )
         })?;
-        if hash_of(&bytes) != hash {
+        if hash(&bytes) != expected {
             return Err(format!("{} is not as a worker has written it", path.display()));
         }
         self.next = (self.next + each).min(self.runs.end);

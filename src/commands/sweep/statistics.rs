@@ -75,7 +75,7 @@ type Rows<'a> = dyn FnMut(Range<u64>, &mut dyn FnMut(u64, &[u8]) -> io::Result<(
 /// Runs that ended in one way.
 struct Ended {
     runs: u64,
-    /// The first of them, and its status in full.
+    /// The first of these runs, and its status in full.
     first: u64,
     status: String,
 }
@@ -166,7 +166,7 @@ impl Tally {
         ])
     }
 
-    /// None if it is not the tally of so many runs.
+    /// Reads what [`Tally::written`] has made; none if it is damaged, or not of this number of runs.
     fn read(table: &SweepTable, number: u64, value: &Value) -> Option<Tally> {
         let [runs, measures, verdicts, ended, rows] = value.as_array()?.as_slice() else { return None };
         let mut tally = Tally::new(table);
