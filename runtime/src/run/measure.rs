@@ -9,7 +9,7 @@
 use crate::run::crossing::{Lobes, period, settling};
 use crate::run::hills::{Hills, Turn};
 use crate::run::peak::{Peak, Point};
-use crate::run::quadrature::{Even, Sum, Sums};
+use crate::run::quadrature::{Even, Sum, Sums, trapezoid};
 use crate::run::verdict::{self, Reading, Verdict};
 use crate::stretch::{Bounds, Stretch};
 use abi::Slot;
@@ -508,12 +508,10 @@ impl Meter {
             }
             Tally::Sum { given: true, .. } => {}
             Tally::Sum { square, sum, even, given: false, .. } => {
-                let value = if *square { v * v } else { v };
                 if self.counted {
-                    let (t0, v0) = previous;
-                    let before = if *square { v0 * v0 } else { v0 };
-                    sum.add(0.5 * (before + value) * (t - t0));
+                    sum.add(trapezoid(previous, (t, v), *square));
                 }
+                let value = if *square { v * v } else { v };
                 if let Some(correction) = even.push(t, value) {
                     sum.add(correction);
                 }

@@ -107,6 +107,14 @@ impl Sum {
     }
 }
 
+/// The area between two points below the straight line through their values, or through the squares of these.
+// Else it would not be part of the functions that are compiled for vectors.
+#[inline(always)]
+pub(crate) fn trapezoid(from: Point, to: Point, square: bool) -> f64 {
+    let of = |v: f64| if square { v * v } else { v };
+    0.5 * (of(from.1) + of(to.1)) * (to.0 - from.0)
+}
+
 /// A compensated sum of many terms, in partial sums that take turns: vectors add to several at once.
 #[derive(Default, Clone, Copy)]
 pub(crate) struct Sums {
@@ -123,15 +131,12 @@ impl Sums {
         self.next = (self.next + 1) % PARTS;
     }
 
-    /// Adds the areas of the trapezoids between consecutive points, the first of which is `from`: as
-    /// [`add`](Sums::add) for one after the other. `square`: below the square of the values.
+    /// Adds the [areas](trapezoid) between consecutive points, the first of which is `from`, as [`add`](Sums::add) does one
+    /// after the other.
     pub(crate) fn add_trapezoids(&mut self, from: Point, times: &[f64], values: &[f64], square: bool) {
         let len = times.len();
-        let of = |v: f64| if square { v * v } else { v };
-        let term = |k: usize| {
-            let (t, v) = if k == 0 { from } else { (times[k - 1], values[k - 1]) };
-            0.5 * (of(v) + of(values[k])) * (times[k] - t)
-        };
+        let at = |k: usize| (times[k], values[k]);
+        let term = |k: usize| trapezoid(if k == 0 { from } else { at(k - 1) }, at(k), square);
         // Up to the first point and to the turn of the first part; then eight at a time, and the others.
         let head = len.min(1 + (2 * PARTS - 1 - self.next) % PARTS);
         (0..head).for_each(|k| self.add(term(k)));
@@ -152,12 +157,11 @@ impl Sums {
 in_vectors! {
     /// Adds the trapezoids between consecutive points to the parts in turn; their number is a multiple of that of the parts.
     fn add_in_turn(parts: &mut [Sum; PARTS], times: &[f64], values: &[f64], square: bool) {
-        let of = |v: f64| if square { v * v } else { v };
         let before = times.as_chunks::<PARTS>().0.iter().zip(values.as_chunks::<PARTS>().0);
         let here = times[1..].as_chunks::<PARTS>().0.iter().zip(values[1..].as_chunks::<PARTS>().0);
         for ((t0, v0), (t, v)) in before.zip(here) {
             for k in 0..PARTS {
-                parts[k].add(0.5 * (of(v0[k]) + of(v[k])) * (t[k] - t0[k]));
+                parts[k].add(trapezoid((t0[k], v0[k]), (t[k], v[k]), square));
             }
         }
     }
