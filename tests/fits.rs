@@ -1009,8 +1009,8 @@ const DRIVEN: [Driven; 4] = [
 const TAIL: &str = "import std.friction\nmodel Tail {\n  input v [m/s]\n  param T = 2 ms in 1 us .. 1 s\n  param d = 300 N·s/m in 1 N·s/m .. 1e4 N·s/m\n  state q [N] = 0 N\n  dq/dt = (d * v * (1 + (v / 5 mm/s)^2) - q) / T\n  output F [N] = q\n}\n";
 
 /// The step moves no value by more than a tenth of its standard deviation: with a quarter of the step that a fit has chosen,
-/// values differ by less than 0.15, whatever the law, the motion and the noise. A step that the text gives is not changed,
-/// and W0912 names it where it is too long, as it names the shortest step that was tried.
+/// values differ by less than 0.15, whatever the law, the motion and the noise. W0912 names a step that is too long: one that
+/// the text gives, because it is not changed, and the shortest one that the search may take.
 ///
 /// Mutant: a comparison with half the step, of which 0.1 is allowed, leaves a LuGre contact that moves by 0.17.
 #[test]

@@ -1,6 +1,6 @@
 //! Measures against their definitions, over random experiments with printed seeds: `slope` against the difference of
-//! the quantity, what is recorded with and without a measure and measured with and without a recording, `count` and `duration` against a count over the recording, peaks and crossings against the closed form
-//! of damped oscillations. `FRIC_SEED`, `FRIC_RUNS` (default 60).
+//! the quantity, what is recorded with and without a measure and measured with and without a recording, `count` and
+//! `duration` against a count over the recording, peaks and crossings against the closed form of damped oscillations. `FRIC_SEED`, `FRIC_RUNS` (default 60).
 
 mod support;
 

@@ -227,7 +227,8 @@ fn units_joined_have_the_bytes_of_one_machine() {
     assert!(sweeps < 10 || (failed > 20 && killed > 0), "{failed} failed runs, {killed} killed units");
 }
 
-/// A design against the sweep over the same values; what is wrong with one is told, and so is an engine without Python.
+/// A design gives the runs of a sweep over the same values. A mistake in one is refused with its place, and so is `--on`
+/// without Python.
 #[test]
 fn a_design_gives_the_runs_of_its_rows() {
     let folder = folder("design");

@@ -383,8 +383,7 @@ const REFUSED_SETS: &[&str] = &[
     "set fr.vs = 0.02 rad/s, pid.Ts = 15 ms",
 ];
 
-/// The same text at the prompt of `fric hil`, by `fric-rig say` and from a page, of the same rig: the same answer. `FRIC_SEED`
-/// gives other texts.
+/// The prompt of `fric hil`, `fric-rig say` and a page give the same answer to the same text. `FRIC_SEED` gives other texts.
 #[test]
 fn every_door_gives_the_same_answer_to_the_same_text() {
     let seed = std::env::var("FRIC_SEED").ok().and_then(|text| text.parse().ok()).unwrap_or(5);

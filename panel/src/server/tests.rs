@@ -2,6 +2,7 @@ use super::*;
 use crate::frame::{Block, Frame, PATH};
 use crate::line::{self, View};
 use crate::subject::Page;
+use runtime::rng::Chance;
 use serde_json::{Value, json};
 use std::io::{Read, Write};
 use std::sync::Mutex;
@@ -241,16 +242,11 @@ fn guests_look_and_may_stop_and_no_more() {
     assert!(refused.err().is_some_and(|why| why.contains("name one of this computer")));
 }
 
-/// Whatever comes before the right key: whole frames of every kind, broken ones, and bytes that are no frames. None of
-/// it is obeyed, the stranger receives no data, and the panel continues to serve.
 /// Frames of the protocol and what is nearly such: final or not, with or without reserved bits, any opcode, masked or not,
 /// and any length.
 fn frames(seed: u64) -> Vec<u8> {
-    let mut state = seed;
-    let mut below = |n: u64| {
-        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-        (state >> 33) % n
-    };
+    let mut chance = Chance(seed);
+    let mut below = |n: u64| chance.below(n);
     let mut bytes = Vec::new();
     for _ in 0..1 + below(4) {
         let text: &[u8] = match below(4) {
@@ -283,6 +279,8 @@ fn answer_to(socket: &mut WebSocket<TcpStream>, bytes: &[u8]) -> String {
     String::from_utf8_lossy(&told).into_owned()
 }
 
+/// Whatever comes before the right key: whole frames of every kind, broken ones, and bytes that are no frames. None of
+/// it is obeyed, the stranger receives no data, and the panel continues to serve.
 #[test]
 fn nothing_before_the_key_is_obeyed() {
     let open = open();
