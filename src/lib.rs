@@ -41,12 +41,38 @@ use commands::End;
 use std::ffi::OsString;
 use std::time::Instant;
 
+/// Applies `FRIC_LANES`, with which tests stand in for other processors: docs/machine-code.md. To be called before any code
+/// is compiled.
+///
+/// # Errors
+/// If it is none of the numbers that there are.
+pub fn limit_lanes() -> Result<(), String> {
+    const NAME: &str = "FRIC_LANES";
+    let Some(given) = std::env::var_os(NAME).filter(|given| !given.is_empty()) else { return Ok(()) };
+    match given.to_str() {
+        Some(known @ ("0" | "1" | "2" | "4" | "8")) => {
+            compiler::codegen::target::limit_lanes(known.parse().expect("a digit"));
+            Ok(())
+        }
+        _ => Err(format!(
+            "{NAME}={}: the most numbers of a vector are 0 (interpreter), 1, 2, 4 (AVX2) or 8 (AVX-512); unset it to use \
+             what the processor has",
+            given.display()
+        )),
+    }
+}
+
 /// Runs the command with these arguments, the name of the program first; returns the exit code. Ends the process if the
 /// arguments are wrong or ask for help.
 pub fn main_with(arguments: impl IntoIterator<Item = OsString>) -> u8 {
     let begin = Instant::now();
     let args = args::parse(arguments);
-    match commands::run(&args, begin, &mut terminal::Terminal::new()) {
+    let mut terminal = terminal::Terminal::new();
+    if let Err(why) = limit_lanes() {
+        terminal.error(&why);
+        return 2;
+    }
+    match commands::run(&args, begin, &mut terminal) {
         End::Fine => 0,
         End::Failed => 1,
         End::Misused => 2,

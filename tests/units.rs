@@ -1,5 +1,5 @@
 //! A sweep cut into units and joined has the bytes of the sweep on one machine: for generated sweeps of all kinds, and
-//! random cuts, orders, repetitions and killed units. `FRIC_SEED`, `FRIC_RUNS` (default 10 sweeps).
+//! random cuts, orders, repetitions, killed units, and processors with narrower vectors. `FRIC_SEED`, `FRIC_RUNS` (default 10 sweeps).
 
 mod support;
 
@@ -71,16 +71,24 @@ fn folder(name: &str) -> PathBuf {
 fn fric(folder: &Path, args: &[&str]) -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_fric"));
     command.current_dir(folder).args(args).stdin(Stdio::null()).env_remove("SLURM_ARRAY_TASK_ID");
-    command.env_remove("JOB_COMPLETION_INDEX");
+    command.env_remove("JOB_COMPLETION_INDEX").env_remove("FRIC_LANES");
     command
+}
+
+/// Values of `FRIC_LANES`: the interpreter, scalar code, and vectors of two, four and eight numbers.
+const LANES: [&str; 5] = ["0", "1", "2", "4", "8"];
+
+#[track_caller]
+fn ends(command: &mut Command, code: i32) -> (String, String) {
+    let Output { status, stdout, stderr } = command.output().unwrap();
+    let (out, err) = (String::from_utf8(stdout).unwrap(), String::from_utf8(stderr).unwrap());
+    assert_eq!(status.code(), Some(code), "{command:?}\n{out}\n{err}");
+    (out, err)
 }
 
 #[track_caller]
 fn run(folder: &Path, args: &[&str], code: i32) -> (String, String) {
-    let Output { status, stdout, stderr } = fric(folder, args).output().unwrap();
-    let (out, err) = (String::from_utf8(stdout).unwrap(), String::from_utf8(stderr).unwrap());
-    assert_eq!(status.code(), Some(code), "{args:?}\n{out}\n{err}");
-    (out, err)
+    ends(&mut fric(folder, args), code)
 }
 
 fn texts(folder: &Path) {
@@ -173,20 +181,28 @@ fn units_joined_have_the_bytes_of_one_machine() {
         fs::remove_file(folder.join("spring.fric")).unwrap();
         fs::remove_file(folder.join("push.csv")).unwrap();
         let units = random_units(&mut chance, total);
+        // Each on a machine of its own, in any order.
+        let first = chance.below(5) as usize;
+        let made_on = |unit: usize| LANES[(first + unit) % LANES.len()];
         let names: Vec<String> = (0..units.len()).map(|k| format!("{k}.fricunit")).collect();
-        for (unit, name) in units.iter().zip(&names) {
+        for (at, (unit, name)) in units.iter().zip(&names).enumerate() {
+            let on_it = |args: &[&str]| {
+                let mut command = fric(&elsewhere, args);
+                command.env("FRIC_LANES", made_on(at));
+                command
+            };
             let runs = format!("{}..{}", unit.start, unit.end);
             let threads = (1 + chance.below(3)).to_string();
             let mut args = vec!["sweep", "--unit", &runs, "plan.fricjob", "-o", name, "-q", "--threads", &threads];
             args.extend((chance.below(3) == 0).then_some("--interpret"));
             if chance.below(2) == 0 {
-                let mut child = fric(&elsewhere, &args).spawn().unwrap();
+                let mut child = on_it(&args).spawn().unwrap();
                 std::thread::sleep(Duration::from_micros(chance.below(150_000)));
                 child.kill().unwrap();
                 child.wait().unwrap();
                 killed += usize::from(!elsewhere.join(name).exists());
             }
-            run(&elsewhere, &args, 0);
+            ends(&mut on_it(&args), 0);
             units_made += 1;
             if chance.below(3) == 0 {
                 // Again: it is there already.
@@ -225,6 +241,54 @@ fn units_joined_have_the_bytes_of_one_machine() {
     }
     println!("{units_made} units, {killed} killed before they were written; {failed} runs failed");
     assert!(sweeps < 10 || (failed > 20 && killed > 0), "{failed} failed runs, {killed} killed units");
+}
+
+/// Units that are made by the interpreter, by scalar code and in vectors of each width, in one sweep: the bytes of one
+/// machine. What each was made in is what was asked for, as far as this processor has it.
+#[test]
+fn processors_of_all_kinds_make_one_sweep() {
+    let folder = folder("kinds");
+    texts(&folder);
+    let on = |lanes: &str, args: &[&str], code| {
+        let mut command = fric(&folder, args);
+        ends(command.env("FRIC_LANES", lanes), code)
+    };
+    let names = LANES.map(|lanes| {
+        let (out, _) = on(lanes, &["bench", "spring.fric", "fixed", "--json"], 0);
+        let found: Value = serde_json::from_str(&out).unwrap();
+        found["lanes"]["code"].as_str().map(str::to_string)
+    });
+    println!("{names:?}");
+    assert_eq!((&names[0], &names[1]), (&None, &None));
+    #[cfg(target_arch = "x86_64")]
+    for (has, name, lanes) in [
+        (std::arch::is_x86_feature_detected!("avx"), "AVX ×", 2),
+        (std::arch::is_x86_feature_detected!("avx2"), "AVX2 ×", 3),
+        (std::arch::is_x86_feature_detected!("avx512dq"), "AVX-512 ×", 4),
+    ] {
+        assert!(!has || names[lanes].as_ref().is_some_and(|found| found.starts_with(name)), "{name}: {names:?}");
+    }
+    for (experiment, keep, out) in
+        [("fixed", "rows", "t.csv"), ("adaptive", "rows", "t.parquet"), ("cases", "summary", "t.json")]
+    {
+        let sweep =
+            ["sweep", "spring.fric", experiment, "--vary", VARIED[0][2], "--vary", VARIED[1][1], "--runs", "200", "-q"];
+        let sweep = |more: &[&'static str]| [&sweep[..], &["--seed", "3", "--keep", keep], more].concat();
+        run(&folder, &sweep(&["--threads", "1", "--out", out]), 0);
+        let whole = fs::read(folder.join(out)).unwrap();
+        run(&folder, &sweep(&["--plan", "p.fricjob"]), 0);
+        let mut units = Vec::new();
+        for (k, lanes) in LANES.iter().enumerate() {
+            units.push(format!("{k}.fricunit"));
+            on(lanes, &["sweep", "--unit", &format!("{k}/5"), "p.fricjob", "-q", "--out", &units[k]], 0);
+        }
+        let units: Vec<&str> = units.iter().map(String::as_str).collect();
+        run(&folder, &[&["sweep", "--join", "p.fricjob"], &units[..], &["-q", "--out", out]].concat(), 0);
+        assert!(fs::read(folder.join(out)).unwrap() == whole, "{experiment}");
+        units.iter().for_each(|unit| fs::remove_file(folder.join(unit)).unwrap());
+    }
+    let (_, err) = on("3", &["sweep", "spring.fric", "fixed", "--vary", "k = 1 N/m", "-q"], 2);
+    assert!(err.contains("FRIC_LANES=3: the most numbers of a vector are 0 (interpreter)"), "{err}");
 }
 
 /// A design gives the runs of a sweep over the same values. A mistake in one is refused with its place, and so is `--on`

@@ -101,6 +101,7 @@ mod _fric {
 
     #[pymodule_init]
     fn init(module: &Bound<'_, PyModule>) -> PyResult<()> {
+        fric::limit_lanes().map_err(PyValueError::new_err)?;
         module.add("__version__", env!("CARGO_PKG_VERSION"))
     }
 }

@@ -298,6 +298,20 @@ fn refused(func: &Func, error: &CodegenError) -> Unsupported {
     }
 }
 
+/// The most numbers of a vector, where it is limited.
+static MOST_LANES: OnceLock<usize> = OnceLock::new();
+
+/// Lets the process stand in for a processor with narrower vectors, from the first code that is compiled on: vectors of at
+/// most so many numbers, 1 for scalar code alone, 0 for none, so that everything is interpreted.
+pub fn limit_lanes(most: usize) {
+    let _ = MOST_LANES.set(most);
+}
+
+/// The most numbers that a vector may have.
+pub fn most_lanes() -> usize {
+    MOST_LANES.get().copied().unwrap_or(usize::MAX)
+}
+
 /// The processor that this program runs on, with all features it has.
 pub fn here() -> Result<&'static OwnedTargetIsa, Unsupported> {
     here_with(Registers::default())
@@ -316,6 +330,9 @@ pub fn here_with(registers: Registers) -> Result<&'static OwnedTargetIsa, Unsupp
 }
 
 fn native(registers: Registers) -> Result<OwnedTargetIsa, Unsupported> {
+    if most_lanes() == 0 {
+        return Err(Unsupported("FRIC_LANES=0 asks for the interpreter".into()));
+    }
     // Without these features fma, floor and nearest would become library calls.
     #[cfg(target_arch = "x86_64")]
     for feature in [Feature::Fma, Feature::Sse41] {

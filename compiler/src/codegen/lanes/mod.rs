@@ -22,7 +22,7 @@ mod isel;
 mod schedule;
 mod regalloc;
 
-use super::target::{FunctionCompiler, here};
+use super::target::{FunctionCompiler, here, most_lanes};
 use super::unsupported::Unsupported;
 use crate::codegen::executable_memory::Executable;
 use crate::codegen::lanes::assembler::{Assembler, Base, Vectors, instructions};
@@ -65,12 +65,14 @@ impl Width {
         Width::ALL.into_iter().rev().filter(|width| width.is_here())
     }
 
-    /// Whether this processor has it, and the calling convention of the generated code.
+    /// Whether this processor has it, and the calling convention of the generated code, and it is not
+    /// [too wide](super::target::limit_lanes).
     pub fn is_here(self) -> bool {
-        match self.vectors_of_x64() {
+        let has = match self.vectors_of_x64() {
             Some(vectors) => vectors.are_here(),
             None => here().is_ok(),
-        }
+        };
+        has && self.lanes() <= most_lanes()
     }
 
     /// Lanes of a vector.
