@@ -498,7 +498,7 @@ pub struct Sweep {
     /// Continue an unfinished table
     #[arg(long)]
     pub resume: bool,
-    /// Run it on a cluster of Dask, dask://host:8786; for the command of the Python package
+    /// Run it on a cluster, dask://host:8786 or ray://host:10001; for the command of the Python package
     #[arg(long, value_name = "ADDRESS")]
     pub on: Option<String>,
     /// Compute one of N parts; the tables of all parts in order are that of the whole

@@ -175,8 +175,9 @@ def sweep(
     distribution (:func:`normal`, :func:`lognormal`, :func:`uniform`), drawn ``runs`` times. ``design``: runs of your
     own, a DataFrame or a mapping from paths, such as ``"m"`` in SI or ``"m [g]"``, to columns of one length. ``out``: a name that ends in
     ``.csv`` or ``.parquet``, or a folder for a dataset of Parquet files; else the table is in memory. ``keep``: ``"rows"``;
-    ``"summary"``, statistics alone, in memory or as ``.json``; or ``"both"``, a table with statistics. ``on``: where it is run: a client or cluster of Dask, its address ``"dask://host:8786"``, or any executor with ``submit``; else
-    ``threads`` threads here. ``shared``: the workers write the files of a dataset, into a folder that all machines see under
+    ``"summary"``, statistics alone, in memory or as ``.json``; or ``"both"``, a table with statistics. ``on``: where it is
+    run: a client or cluster of Dask, its address ``"dask://host:8786"``, the module ``ray`` after ``ray.init``,
+    ``"ray://host:10001"``, or any executor with ``submit``; else ``threads`` threads here. ``shared``: the workers write the files of a dataset, into a folder that all machines see under
     one name; only their hashes are sent. ``unit``: about how many seconds of work are sent at once. ``resume``: goes on with a table
     that was interrupted, here or elsewhere. A unit whose worker dies is sent again, up to ``retries`` times.
     """
@@ -426,6 +427,10 @@ class _Engine:
         except queue.Empty:
             return []
 
+    def result(self, future: Any) -> Any:
+        """What a future that has ended returns, or raises."""
+        return future.result()
+
     def lost(self) -> str | None:
         """Why nothing more will come of what was sent; else none."""
         return None
@@ -474,6 +479,41 @@ class _Dask(_Engine):
             self._client.close()
 
 
+class _Ray(_Engine):
+    """Tasks of Ray, which it does not repeat by itself."""
+
+    def __init__(self, ray: Any, own: bool):
+        super().__init__(ray)
+        self._ray, self._own = ray, own
+        self._task = ray.remote(max_retries=0, num_cpus=1)(_called)
+
+    def slots(self) -> int:
+        return max(1, int(self._ray.cluster_resources().get("CPU", 1)))
+
+    def _submit(self, plan: bytes, first: int, last: int) -> Any:
+        task = self._task.remote(self.work, plan, first, last)
+        future = task.future()
+        future.task = task
+        return future
+
+    def result(self, future: Any) -> Any:
+        try:
+            return future.result()
+        except self._ray.exceptions.RayTaskError as error:
+            # It wraps the exception of the unit, whose message and fields count.
+            raise error.cause from None
+
+    def close(self, sent: Iterable[Any]) -> None:
+        for future in sent:
+            self._ray.cancel(future.task, force=True)
+        if self._own:
+            self._ray.shutdown()
+
+
+def _called(work: Any, plan: bytes, first: int, last: int) -> Any:
+    return work(plan, first, last)
+
+
 def _engine(on: Any, threads: int | None) -> _Engine:
     if on is None:
         return _Threads(threads)
@@ -481,12 +521,19 @@ def _engine(on: Any, threads: int | None) -> _Engine:
         raise ValueError("threads: a unit runs on one thread of the engine; its own settings say how many there are")
     if isinstance(on, str):
         scheme, _, address = on.partition("://")
-        if scheme != "dask" or not address:
-            raise ValueError(f"on: {on!r} is no engine; write \"dask://host:8786\", or pass a client or an executor")
+        if scheme not in ("dask", "ray") or not address:
+            raise ValueError(
+                f"on: {on!r} is no engine; write \"dask://host:8786\" or \"ray://host:10001\", or pass a client or an executor"
+            )
         try:
+            if scheme == "ray":
+                import ray  # type: ignore
+
+                ray.init(on)
+                return _Ray(ray, own=True)
             from distributed import Client
         except ImportError:
-            raise ImportError("on: Dask is not installed here: pip install 'fric[dask]'") from None
+            raise ImportError(f"on: {scheme.title()} is not installed here: pip install 'fric[{scheme}]'") from None
         return _Dask(Client(f"tcp://{address}"), own=True)
     if hasattr(on, "get_client") and hasattr(on, "scheduler_address"):
         return _Dask(on.get_client(), own=True)
@@ -494,13 +541,19 @@ def _engine(on: Any, threads: int | None) -> _Engine:
         return _Dask(on, own=False)
     if hasattr(on, "submit"):
         return _Engine(on)
-    raise TypeError(f"on: {type(on).__name__} has no `submit`; pass a client or cluster of Dask, or an executor")
+    if hasattr(on, "remote") and hasattr(on, "cluster_resources"):
+        return _Ray(on, own=False)
+    raise TypeError(
+        f"on: {type(on).__name__} has no `submit`; pass a client or cluster of Dask, the module `ray`, or an executor"
+    )
 
 
 def _is_death(error: BaseException) -> bool:
     """Whether a worker ended under a unit, so that another may finish it."""
+    of_dask = {"KilledWorker", "CancelledError", "FutureCancelledError", "CommClosedError"}
+    of_ray = {"WorkerCrashedError", "NodeDiedError", "OutOfMemoryError"}
     names = {kind.__name__ for kind in type(error).__mro__}
-    return bool(names & {"KilledWorker", "CancelledError", "FutureCancelledError", "CommClosedError", "UncompletedJobError"})
+    return bool(names & (of_dask | of_ray | {"UncompletedJobError"}))
 
 
 def _run(
@@ -659,7 +712,7 @@ class _Client:
     def take(self, future: Any) -> None:
         first, last, deaths = self.sent.pop(future)
         try:
-            unit, seconds = future.result()
+            unit, seconds = self.engine.result(future)
         except Exception as error:
             if _is_death(error) and self.engine.lost() is None:
                 self.died(first, last, deaths)

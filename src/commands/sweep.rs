@@ -111,9 +111,10 @@ fn table_name(args: &Sweep, keep: Keep) -> Result<PathBuf, Fault> {
 /// The sweep of a text: run, or written as a plan.
 fn of_text(args: &Sweep, terminal: &mut Terminal) -> Result<End, Fault> {
     if let Some(address) = &args.on {
+        let engine = if address.starts_with("ray:") { "ray" } else { "dask" };
         return Err(Fault::Misused(format!(
-            "--on {address} needs the Python package, whose `fric` sends units to Dask: pip install 'fric[dask]'; without \
-             Python see --plan and --unit"
+            "--on {address} needs the Python package, whose `fric` sends units to a cluster: pip install 'fric[{engine}]'; \
+             without Python see --plan and --unit"
         )));
     }
     let out = table_name(args, args.keep.unwrap_or_default())?;
