@@ -25,7 +25,7 @@ pub use compiler::experiment::vary::{PreparedRun, Varying};
 pub use compiler::fit::{
     Asks, Fit, Item as FitItem, Part as FitPart, Unknown as FitUnknown, find as find_fit, single as single_fit,
 };
-pub use compiler::frontend::columns::{Columns, Selector, read as read_columns};
+pub use compiler::frontend::columns::{Columns, Fault, Selector, read as read_columns};
 pub use compiler::frontend::names::nearest;
 pub use compiler::frontend::resolve::{Lookup, Space};
 pub use compiler::frontend::system::LINTS;

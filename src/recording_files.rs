@@ -244,7 +244,7 @@ mod tests {
                 let text = text(bytes, format).unwrap_or_else(|why| panic!("{}: {why}", said()));
                 // Columns of one row are settings beside longer ones, and the only columns otherwise.
                 let wanted = vec![Selector::Place; headings.len()];
-                let found = read(&text, &wanted).unwrap_or_else(|why| panic!("{}: {why}\n{text}", said()));
+                let found = read(&text, &wanted).unwrap_or_else(|why| panic!("{}: {why:?}\n{text}", said()));
                 assert_eq!(found.numbers, expected, "{}", said());
                 for (heading, unit) in headings.iter().zip(&found.units) {
                     let stated = heading.rsplit_once(" [").map(|(_, unit)| unit.trim_end_matches(']').to_string());

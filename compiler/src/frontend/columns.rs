@@ -49,10 +49,29 @@ struct Heading {
     unit: Result<Option<Unit>, String>,
 }
 
+/// Why columns cannot be read.
+#[derive(Clone, PartialEq, Debug)]
+pub struct Fault {
+    /// The first error, in words that begin with the line.
+    pub what: String,
+    /// What to do about it.
+    pub help: String,
+}
+
+fn fault<T>(what: String, help: impl Into<String>) -> Result<T, Fault> {
+    Err(Fault { what, help: help.into() })
+}
+
+/// Fewer columns than are named.
+fn too_few(line: &str, has: usize, needed: usize) -> Fault {
+    let what = format!("{line} has {has} columns, {needed} are needed");
+    Fault { what, help: "name the columns that the file has, in its order".into() }
+}
+
 /// Reads the wanted columns of a text.
 ///
-/// # Errors The first error, in words that begin with the line.
-pub fn read(text: &str, wanted: &[Selector]) -> Result<Columns, String> {
+/// # Errors The first error.
+pub fn read(text: &str, wanted: &[Selector]) -> Result<Columns, Fault> {
     let mut out = Columns { numbers: vec![Vec::new(); wanted.len()], units: vec![None; wanted.len()], places: vec![] };
     let mut separator = None;
     // The number of cells, and whether there is a heading that names them.
@@ -74,24 +93,27 @@ pub fn read(text: &str, wanted: &[Selector]) -> Result<Columns, String> {
             if headed {
                 let headings = fields.iter().enumerate().map(|(k, field)| heading(&field.text, at, k));
                 let headings: Vec<Heading> = headings.collect();
-                places = found(&headings, wanted).map_err(|what| format!("line {at} {what}"))?;
+                places = found(&headings, wanted, &format!("line {at}"))?;
                 // A unit that is not known matters only in a column that is used.
                 for (unit, place) in out.units.iter_mut().zip(&places) {
-                    *unit = place.map_or(Ok(None), |place| headings[place].unit.clone())?;
+                    let stated = place.map_or(Ok(None), |place| headings[place].unit.clone());
+                    *unit = stated.or_else(|what| fault(what, "write a unit such as `mm` in the heading, or none"))?;
                 }
             } else {
                 if let Some(Selector::Headed(name)) = wanted.iter().find(|one| matches!(one, Selector::Headed(_))) {
-                    return Err(format!("line {at} is no heading, so there is no column \"{}\"", shown(name)));
+                    return fault(
+                        format!("line {at} is no heading, so there is no column \"{}\"", shown(name)),
+                        "write the headings into the first line of the file, or name its columns in their order",
+                    );
                 }
                 if fields.len() < wanted.len() {
-                    return Err(format!("line {at} has {} columns, {} are needed", fields.len(), wanted.len()));
+                    return Err(too_few(&format!("line {at}"), fields.len(), wanted.len()));
                 }
                 if fields.len() > wanted.len() {
-                    return Err(format!(
-                        "line {at} has {} columns, {} are named; name the others `_`, and write decimals with a point",
-                        fields.len(),
-                        wanted.len()
-                    ));
+                    return fault(
+                        format!("line {at} has {} columns, {} are named", fields.len(), wanted.len()),
+                        "name the others `_`, and write decimals with a point",
+                    );
                 }
                 places = by_place(wanted);
                 push(&mut out, &fields, &places, by, &mut decimals, at)?;
@@ -103,7 +125,10 @@ pub fn read(text: &str, wanted: &[Selector]) -> Result<Columns, String> {
         };
         if fields.len() != count {
             let first = if headed { "the heading" } else { "the first line" };
-            return Err(format!("line {at} has {} columns, {first} {count}", fields.len()));
+            return fault(
+                format!("line {at} has {} columns, {first} {count}", fields.len()),
+                "complete the line or remove it; write decimals with a point, or separate cells with semicolons",
+            );
         }
         if std::mem::take(&mut first_after_heading) && !fields.iter().any(is_number) {
             for (unit, place) in out.units.iter_mut().zip(&places) {
@@ -112,11 +137,17 @@ pub fn read(text: &str, wanted: &[Selector]) -> Result<Columns, String> {
                 if text.is_empty() || text == "-" {
                     continue;
                 }
-                let stated = Unit::parse(text).map_err(|part| {
-                    format!("line {at}, column {}: `{}` is neither a number nor a unit", place + 1, shown(&part))
+                let stated = Unit::parse(text).or_else(|part| {
+                    fault(
+                        format!("line {at}, column {}: `{}` is neither a number nor a unit", place + 1, shown(&part)),
+                        "write a unit such as `mm`, or begin a line of words with `#`",
+                    )
                 })?;
                 if let Some(before) = unit.as_ref().filter(|before| **before != stated) {
-                    return Err(format!("line {at}, column {}: {stated} here, {before} in the heading", place + 1));
+                    return fault(
+                        format!("line {at}, column {}: {stated} here, {before} in the heading", place + 1),
+                        "state the unit once, or the same in both lines",
+                    );
                 }
                 *unit = Some(stated);
             }
@@ -136,8 +167,8 @@ fn by_place(wanted: &[Selector]) -> Vec<Option<usize>> {
 /// By heading, if a column says its heading or if the headings have all names; else by place. A name that the headings
 /// have at another place than the text is an error: by place it would be read from another column.
 ///
-/// # Errors Why not, in words that follow "the file" or "line 1".
-fn found(headings: &[Heading], wanted: &[Selector]) -> Result<Vec<Option<usize>>, String> {
+/// # Errors Why not. `line`: of the headings.
+fn found(headings: &[Heading], wanted: &[Selector], line: &str) -> Result<Vec<Option<usize>>, Fault> {
     let at = |name: &str| -> Vec<usize> {
         let exact = |heading: &Heading| heading.cell == name;
         let places = |fits: &dyn Fn(&Heading) -> bool| (0..headings.len()).filter(|k| fits(&headings[*k])).collect();
@@ -158,28 +189,32 @@ fn found(headings: &[Heading], wanted: &[Selector]) -> Result<Vec<Option<usize>>
                 [] => {
                     let all = headings.iter().map(|heading| heading.name.as_str());
                     let known: Vec<String> = all.clone().map(shown).collect();
-                    let near = nearest(name, all).map_or(String::new(), |near| format!("; did you mean \"{near}\"?"));
-                    Err(format!("has no column \"{}\", only {}{near}", shown(name), known.join(", ")))
+                    let help = match nearest(name, all) {
+                        Some(near) => format!("did you mean \"{near}\"?"),
+                        None => "write the heading as the file has it, as in `x [mm] = \"Position\"`".into(),
+                    };
+                    fault(format!("{line} has no column \"{}\", only {}", shown(name), known.join(", ")), help)
                 }
-                _ => Err(format!("has several columns \"{}\"", shown(name))),
+                _ => fault(
+                    format!("{line} has several columns \"{}\"", shown(name)),
+                    "give them different headings in the file, or name its columns in their order",
+                ),
             },
         };
         return wanted.iter().map(place).collect();
     }
     if headings.len() < wanted.len() {
-        return Err(format!("has {} columns, {} are needed", headings.len(), wanted.len()));
+        return Err(too_few(line, headings.len(), wanted.len()));
     }
     for (k, one) in wanted.iter().enumerate() {
         if let Selector::Named(name) = one
             && let [other] = at(name)[..]
             && other != k
         {
-            return Err(format!(
-                "calls column {} `{name}`, and the text column {}: give each column its heading, as in `{name} = \"{}\"`",
-                other + 1,
-                k + 1,
-                shown(&headings[other].cell)
-            ));
+            return fault(
+                format!("{line} calls column {} `{name}`, and the text column {}", other + 1, k + 1),
+                format!("give each column its heading, as in `{name} = \"{}\"`", shown(&headings[other].cell)),
+            );
         }
     }
     Ok(by_place(wanted))
@@ -248,24 +283,30 @@ fn push(
     separator: Option<char>,
     decimals: &mut Option<(bool, usize)>,
     at: usize,
-) -> Result<(), String> {
+) -> Result<(), Fault> {
     for (wanted, place) in places.iter().enumerate() {
         let Some(k) = *place else { continue };
         let field = &fields[k];
         let Some((number, comma)) = number(field, separator) else {
-            return Err(format!("line {at}, column {}: `{}` is no finite number", k + 1, shown(&field.text)));
+            return fault(
+                format!("line {at}, column {}: `{}` is no finite number", k + 1, shown(&field.text)),
+                "write a number there, or remove the line; a column that is not used is called `_`",
+            );
         };
         if comma || field.text.contains('.') {
             let (of_before, line) = *decimals.get_or_insert((comma, at));
             if of_before != comma {
                 let sign = |comma: bool| if comma { "comma" } else { "point" };
-                return Err(format!(
-                    "line {at}, column {}: `{}` has a decimal {}, line {line} a decimal {}",
-                    k + 1,
-                    shown(&field.text),
-                    sign(comma),
-                    sign(of_before)
-                ));
+                return fault(
+                    format!(
+                        "line {at}, column {}: `{}` has a decimal {}, line {line} a decimal {}",
+                        k + 1,
+                        shown(&field.text),
+                        sign(comma),
+                        sign(of_before)
+                    ),
+                    "write all numbers of the file with the same decimal mark",
+                );
             }
         }
         out.numbers[wanted].push(number);
@@ -308,6 +349,14 @@ mod tests {
     use super::*;
     use crate::ir::random::Random;
 
+    /// The columns, or the first error.
+    fn read(text: &str, wanted: &[Selector]) -> Result<Columns, String> {
+        super::read(text, wanted).map_err(|fault| {
+            assert!(!fault.help.is_empty(), "{fault:?}");
+            fault.what
+        })
+    }
+
     fn numbers(text: &str) -> Result<Vec<Vec<f64>>, String> {
         read(text, &[Selector::Place; 2]).map(|columns| columns.numbers)
     }
@@ -315,10 +364,7 @@ mod tests {
     #[test]
     fn decimal_commas_are_decimals_or_an_error() {
         assert_eq!(numbers("t;x\n0;1,5\n1;3,5\n"), Ok(vec![vec![0.0, 1.0], vec![1.5, 3.5]]));
-        assert_eq!(
-            numbers("0,5 1,5\n1 3\n").unwrap_err(),
-            "line 1 has 3 columns, 2 are named; name the others `_`, and write decimals with a point"
-        );
+        assert_eq!(numbers("0,5 1,5\n1 3\n").unwrap_err(), "line 1 has 3 columns, 2 are named");
         assert_eq!(numbers("t,x\n0,1,5\n").unwrap_err(), "line 2 has 3 columns, the heading 2");
         assert_eq!(numbers("t,x\n\"0\",\"1,5\"\n"), Ok(vec![vec![0.0], vec![1.5]]));
         assert_eq!(
@@ -355,12 +401,9 @@ mod tests {
         assert_eq!(found(&[Selector::Named("t"), Selector::Unused, Selector::Named("s")]), Ok(vec![1, 0, 3]));
         assert_eq!(
             found(&[Selector::Named("t"), Selector::Named("x"), Selector::Unused]).unwrap_err(),
-            "line 1 calls column 3 `x`, and the text column 2: give each column its heading, as in `x = \"x (mm)\"`"
+            "line 1 calls column 3 `x`, and the text column 2"
         );
-        assert_eq!(
-            found(&[Selector::Headed("tme")]).unwrap_err(),
-            "line 1 has no column \"tme\", only time, F, x; did you mean \"time\"?"
-        );
+        assert_eq!(found(&[Selector::Headed("tme")]).unwrap_err(), "line 1 has no column \"tme\", only time, F, x");
         let twice = read("a,a\n1,2\n", &[Selector::Headed("a")]);
         assert_eq!(twice.unwrap_err(), "line 1 has several columns \"a\"");
         let bare = read("1,2\n", &[Selector::Headed("a"), Selector::Unused]);

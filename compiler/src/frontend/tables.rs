@@ -90,9 +90,9 @@ pub fn columns(
     let names: Vec<Selector> = wanted.iter().map(|(one, _)| *one).collect();
     let read = match columns::read(&text, &names) {
         Ok(read) => read,
-        Err(what) => {
+        Err(columns::Fault { what, help }) => {
             let error = Diagnostic::error("E0903", format!("\"{}\" does not fit", path.text)).label(path.span, what);
-            diagnostics.push(error);
+            diagnostics.push(error.help(help));
             return None;
         }
     };

@@ -3,7 +3,7 @@
 //! In: the recording as CSV. Out: a text with a fit for each law. A range spans what the data can tell of a parameter of
 //! its dimension: forces by the largest one, speeds by those that occur, stiffnesses by force and path.
 
-use crate::compile::{Columns, Selector, read_columns};
+use crate::compile::{Columns, Fault, Selector, read_columns};
 use abi::unit::Unit;
 use std::fmt::Write;
 
@@ -85,7 +85,8 @@ pub fn text(recording: &str, file: &str) -> Result<String, String> {
             "its heading has neither t, v, F nor t, x, F nor v, F: `{heading}`; write one, such as `t [s],v [mm/s],F [N]`, or a fit that names the columns"
         )
     })?;
-    let Columns { numbers, units, .. } = read_columns(recording, &selectors(shape))?;
+    let read = read_columns(recording, &selectors(shape));
+    let Columns { numbers, units, .. } = read.map_err(|Fault { what, help }| format!("{what}\n  mend: {help}"))?;
     let mut columns = Vec::new();
     let mut data: Vec<Vec<f64>> = Vec::new();
     for (((name, si), unit), numbers) in shape.0.iter().zip(units).zip(numbers) {
