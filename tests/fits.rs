@@ -793,6 +793,17 @@ fn alternatives_of_a_slot_are_ranked() {
         let lines = String::from_utf8_lossy(&output.stdout);
         let all: Vec<Value> = lines.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
         assert_eq!(all.len(), 3, "seed {seed}: {output:?}");
+        // The table and the object say the same of the difference of neighbours.
+        let than_next = &all[0]["than_next"];
+        assert_eq!(
+            (&than_next["law"], &than_next["pieces"]),
+            (&all[1]["alternative"], &Value::from(10)),
+            "seed {seed}"
+        );
+        assert_eq!(all[2]["than_next"], Value::Null, "seed {seed}");
+        let better = than_next["better"].as_u64().unwrap();
+        let [gain, sd] = ["gain", "gain_sd"].map(|name| than_next[name].as_f64().unwrap());
+        assert!(better <= 10 && gain.is_finite() && sd > 0.0, "seed {seed}: {than_next}");
         assert_eq!((&all[0]["alternative"], &all[0]["rank"]), (&Value::from("fr = CoulombViscous()"), &Value::from(1)));
         let coulomb = all.iter().find(|one| one["alternative"] == "fr = Coulomb()").unwrap();
         assert_eq!(coulomb["parameters"].as_array().unwrap().len(), 1, "seed {seed}: Coulomb has no Fv");
@@ -803,6 +814,7 @@ fn alternatives_of_a_slot_are_ranked() {
         }
         let output = fric(&folder, &["fit", "f.fric"]);
         let words = String::from_utf8_lossy(&output.stdout);
+        assert!(words.contains(&format!("better in {better} of 10, by ")), "seed {seed}: {words}");
         assert!(words.contains("ΔBIC") && words.contains("  1  fr = CoulombViscous()"), "{words}");
         let written = fs::read_to_string(folder.join("out/f.fric")).unwrap();
         assert!(written.contains("fr = CoulombViscous()"), "{written}");

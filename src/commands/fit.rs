@@ -214,8 +214,8 @@ struct Asked<'a> {
     data: &'a [String],
     loaded: &'a Loaded,
     name: &'a str,
-    /// Rank among several laws, and the rms of rows that the law has not seen.
-    rank: Option<(usize, f64)>,
+    /// Its place among several laws.
+    rank: Option<&'a answer::Rank>,
 }
 
 /// Shows the answer of a fit and writes its files.
@@ -236,7 +236,7 @@ fn conclude(question: &Asked, runs: &Runs, found: Found, seconds: f64, terminal:
         }
     }
     fitted.coarse = coarse;
-    fitted.rank = rank;
+    fitted.rank = rank.cloned();
     let mut outcomes = Vec::new();
     for ((part, step), items) in runs.parts.iter().zip(&steps).zip(runs.items()) {
         let values = &fitted.answer.values;

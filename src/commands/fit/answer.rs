@@ -9,6 +9,7 @@ use crate::terminal::Terminal;
 use abi::plan::Solver;
 use abi::unit::Unit;
 use grammar::diagnostic::Diagnostic;
+use runtime::fit::ranking::Paired;
 use runtime::fit::statistics::{Dependence, gaps};
 use runtime::fit::{Answer, Combination, Ended};
 use runtime::run::verdict::Verdict;
@@ -20,6 +21,17 @@ const CORRELATED: f64 = 0.9;
 
 /// Step of the text to go on with, as a part of that of the search.
 const FINER: f64 = 0.25;
+
+/// The place of a law among several.
+#[derive(Clone, Debug)]
+pub struct Rank {
+    /// From 1; laws that do not differ share one.
+    pub rank: usize,
+    /// The rms of rows that it has not seen, of the first compared quantity, in SI.
+    pub held_out: f64,
+    /// The next law, and how much better this one is, if both could be fitted.
+    pub than_next: Option<(String, Paired)>,
+}
 
 /// A fit that has an answer.
 pub struct Fitted {
@@ -43,8 +55,8 @@ pub struct Fitted {
     pub level: f64,
     /// Time of the search in s.
     seconds: f64,
-    /// Rank among several laws, and the rms of rows that the law has not seen, in SI.
-    pub rank: Option<(usize, f64)>,
+    /// Its place among several laws.
+    pub rank: Option<Rank>,
     /// Steps that are too long.
     pub coarse: Option<Coarse>,
     /// Notes for the user.
@@ -575,8 +587,15 @@ impl Fitted {
             "no_noise": answer.misfits,
             "chi_square": number(answer.chi_square),
             "degrees_of_freedom": number(answer.degrees),
-            "rank": self.rank.map(|(rank, _)| rank),
-            "held_out_rms": self.rank.map(|(_, rms)| width(&runs.parts[0].asks.items[0].unit, rms)),
+            "rank": self.rank.as_ref().map(|rank| rank.rank),
+            "held_out_rms": self.rank.as_ref().map(|rank| width(&runs.parts[0].asks.items[0].unit, rank.held_out)),
+            "than_next": self.rank.as_ref().and_then(|rank| rank.than_next.as_ref()).map(|(law, paired)| json!({
+                "law": law,
+                "better": paired.better.0,
+                "pieces": paired.better.1,
+                "gain": number(paired.gain.0),
+                "gain_sd": number(paired.gain.1),
+            })),
             "starts": { "judged": answer.starts, "followed": answer.followed, "ended_here": answer.agreed },
             "runs": answer.runs,
             "failures": answer.failures.iter().map(|(why, n)| (why.clone(), json!(n))).collect::<serde_json::Map<_, _>>(),

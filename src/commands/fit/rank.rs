@@ -3,6 +3,7 @@
 //! In: fits that have been searched. Out: a table, and the files of the best. The order is that of the error on rows that a
 //! law has not seen.
 
+use super::answer::Rank;
 use super::search::{Found, Runs};
 use super::{Asked, after, conclude, told};
 use crate::args;
@@ -49,7 +50,17 @@ pub fn rank(
     terminal: &mut Terminal,
 ) -> End {
     let steady = tried.first().is_some_and(|one| one.runs.parts[0].asks.steady);
-    let ranks = ranking::ranks(&contenders(tried), steady);
+    let contenders = contenders(tried);
+    let order = ranking::ranks(&contenders, steady);
+    let ranked = |(at, (k, rank)): (usize, &(usize, usize))| {
+        let than_next = order.get(at + 1).and_then(|(next, _)| {
+            let paired = ranking::paired(&contenders[*k], &contenders[*next], steady)?;
+            Some((tried[*next].law.clone(), paired))
+        });
+        let held_out = tried[*k].held_out.as_ref().map_or(f64::NAN, |rows| rms(&rows[0]));
+        (*k, Rank { rank: *rank, held_out, than_next })
+    };
+    let ranks: Vec<(usize, Rank)> = order.iter().enumerate().map(ranked).collect();
     if !args.json && !args.quiet {
         terminal.print(&table(heading.title, tried, &ranks));
         if let Some(place) = heading.wrote {
@@ -60,10 +71,10 @@ pub fn rank(
     let shown = if args.json { &ranks[..] } else { &ranks[..1] };
     let mut end = End::Fine;
     for (k, rank) in shown {
-        let Tried { name, runs, found, seconds, held_out, .. } = &tried[*k];
+        let Tried { name, runs, found, seconds, .. } = &tried[*k];
         match found {
             Ok(found) => {
-                let rank = Some((*rank, held_out.as_ref().map_or(f64::NAN, |rows| rms(&rows[0]))));
+                let rank = Some(rank);
                 let question = Asked { args, file, data, loaded, name, rank };
                 if conclude(&question, runs, found.clone(), *seconds, terminal) != End::Fine && k == best {
                     end = End::Failed;
@@ -95,7 +106,7 @@ fn contenders(tried: &[Tried]) -> Vec<Contender> {
 }
 
 /// The table of the laws in their order.
-fn table(title: &str, tried: &[Tried], ranks: &[(usize, usize)]) -> String {
+fn table(title: &str, tried: &[Tried], ranks: &[(usize, Rank)]) -> String {
     let first = &tried[0].runs;
     let steady = first.parts[0].asks.steady;
     let rows = if steady { "steady points" } else { "rows" };
@@ -110,14 +121,7 @@ fn table(title: &str, tried: &[Tried], ranks: &[(usize, usize)]) -> String {
     };
     let least = tried.iter().filter_map(&criterion).fold(f64::INFINITY, f64::min);
     let mut table = vec![["", "law", "parameters", "rms", "held out", "ΔBIC", "than the next"].map(str::to_string)];
-    let contenders = contenders(tried);
-    let against = |k: usize, next: Option<&(usize, usize)>| {
-        let Paired { better: (better, all), gain: (gain, error) } =
-            ranking::paired(&contenders[k], &contenders[next?.0], steady)?;
-        let [gain, error] = [gain, error].map(|part| significant(100.0 * part, 2));
-        Some(format!("better in {better} of {all}, by {gain} ± {error} %"))
-    };
-    for (at, (k, rank)) in ranks.iter().enumerate() {
+    for (k, Rank { rank, than_next, .. }) in ranks {
         let one = &tried[*k];
         let items = || one.runs.parts.iter().flat_map(|part| &part.asks.items);
         let each = |residuals: &[Vec<f64>]| -> String {
@@ -130,7 +134,11 @@ fn table(title: &str, tried: &[Tried], ranks: &[(usize, usize)]) -> String {
         };
         let held_out = one.held_out.as_deref().map_or(String::new(), each);
         let bic = criterion(one).map_or(String::new(), |bic| significant(bic - least, 4));
-        let next = against(*k, ranks.get(at + 1)).unwrap_or_default();
+        let next = than_next.as_ref().map_or(String::new(), |(_, paired)| {
+            let Paired { better: (better, all), gain: (gain, error) } = paired;
+            let [gain, error] = [gain, error].map(|part| significant(100.0 * part, 2));
+            format!("better in {better} of {all}, by {gain} ± {error} %")
+        });
         table.push([rank.to_string(), one.law.clone(), one.runs.unknowns.len().to_string(), seen, held_out, bic, next]);
     }
     let width = |column: usize| table.iter().map(|row| row[column].chars().count()).max().unwrap_or(0);
