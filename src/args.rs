@@ -631,7 +631,8 @@ pub struct Excite {
     /// How long the motion is, after one period in which it is faded in
     #[arg(long = "for", value_name = "TIME", value_parser = positive_time)]
     pub duration: f64,
-    /// Limits of what moves, such as 'x = -2 mm .. 2 mm' and 'v = -50 mm/s .. 50 mm/s'; at least one
+    /// Limits of what moves, such as 'x = -2 mm .. 2 mm' and 'v = -50 mm/s .. 50 mm/s', at least one; and of any quantity of
+    /// the model, such as 'fr.F = -2 N .. 2 N'
     #[arg(long = "limit", value_name = "NAME = LOW .. HIGH", required = true)]
     pub limits: Vec<String>,
     /// Number of harmonics of the lowest frequency

@@ -11,6 +11,7 @@ use crate::compile::{self, ElementaryFunction, Loaded, Options, Sources, Stopwat
 use crate::project;
 use crate::quantity::{self, count, duration, show, significant};
 use crate::terminal::{Style, Terminal};
+use abi::Slot;
 use abi::unit::Unit;
 use grammar::ast::{self, ExperimentStatement, Expr, FitStatement};
 use runtime::fit::cma_es::{self, Search};
@@ -37,6 +38,10 @@ const INSTANTS: usize = 64;
 const LEAST_SENSITIVITY: f64 = 4.0;
 /// Criterion of a motion that cannot be run.
 const FAILED: f64 = 1e9;
+/// Most sizes of a motion that are tried for limits of quantities that only a run tells, and the part of a limit that
+/// is near enough.
+const MOST_SCALINGS: usize = 12;
+const NEAR_LIMIT: f64 = 0.99;
 /// Most rows of a design.
 const MOST_ROWS: f64 = 1e6;
 
@@ -175,6 +180,12 @@ struct Limit {
 }
 
 impl Limit {
+    /// `-2 mm .. 2 mm`
+    fn range(&self) -> String {
+        let [low, high] = [self.low, self.high].map(|end| show(end, &self.unit, 4));
+        format!("{low} .. {high}")
+    }
+
     fn read(text: &str) -> Result<Limit, String> {
         let wrong = || format!("--limit: `{text}` is none; write it as 'x = -2 mm .. 2 mm'");
         let (name, range) = text.split_once('=').ok_or_else(wrong)?;
@@ -227,7 +238,10 @@ struct Design {
     unknowns: Vec<Unknown>,
     series: Series,
     moves: Moves,
+    /// Limits of what moves.
     limits: Vec<Limit>,
+    /// Limits of other quantities, each with its slot: only a run tells whether a motion keeps them.
+    watched: Vec<(Limit, Slot)>,
     /// Instants at which limits are checked: position, speed and acceleration there for each coefficient alone.
     shapes: Vec<Vec<[f64; 3]>>,
     /// Deviation of each compared quantity.
@@ -267,6 +281,81 @@ impl Design {
             return vec![0.0; 2 * h];
         }
         coefficients.iter().map(|c| c / most).collect()
+    }
+
+    /// Least and greatest value of each watched quantity for some motions, each with all sets of values; none where a run
+    /// fails.
+    fn extremes(&self, motions: &[Vec<f64>], sets: &[Vec<f64>]) -> Vec<Option<Vec<(f64, f64)>>> {
+        if self.watched.is_empty() {
+            return vec![Some(Vec::new()); motions.len()];
+        }
+        let slots: Vec<Slot> = self.watched.iter().map(|(_, slot)| *slot).collect();
+        let point = |motion: &Vec<f64>| sets.iter().map(|set| [&set[..], motion].concat()).collect::<Vec<_>>();
+        let points: Vec<Vec<f64>> = motions.iter().flat_map(point).collect();
+        let part = &self.runs.parts[0];
+        let all = part.sampled(&points, self.steps[0], &part.asks.rows, &slots);
+        let one = |runs: &[Result<Vec<f64>, String>]| {
+            let mut out = vec![(f64::INFINITY, f64::NEG_INFINITY); slots.len()];
+            for values in runs {
+                for row in values.as_ref().ok()?.chunks(slots.len()) {
+                    for ((low, high), value) in out.iter_mut().zip(row).filter(|(_, value)| value.is_finite()) {
+                        (*low, *high) = (low.min(*value), high.max(*value));
+                    }
+                }
+            }
+            Some(out)
+        };
+        all.chunks(sets.len()).map(one).collect()
+    }
+
+    /// The part of their limits that watched quantities reach for some motions; infinite where a run fails.
+    fn shares(&self, motions: &[Vec<f64>], sets: &[Vec<f64>]) -> Vec<f64> {
+        let of = |(limit, (low, high)): (&Limit, &(f64, f64))| (high / limit.high).max(low / limit.low);
+        let limits = || self.watched.iter().map(|(limit, _)| limit);
+        let most = |all: Vec<(f64, f64)>| limits().zip(&all).map(of).fold(0.0, f64::max);
+        self.extremes(motions, sets).into_iter().map(|one| one.map_or(f64::INFINITY, most)).collect()
+    }
+
+    /// Motions, each made smaller until the watched quantities keep their limits for all sets of values, by secant and
+    /// bisection in turn. What they are at rest they keep; see [`Design::leaves_at_rest`].
+    fn kept(&self, motions: Vec<Vec<f64>>, sets: &[Vec<f64>]) -> Vec<Vec<f64>> {
+        if self.watched.is_empty() || sets.is_empty() {
+            return motions;
+        }
+        let of = |part: f64, motion: &[f64]| motion.iter().map(|c| part * c).collect::<Vec<f64>>();
+        let rest = self.shares(&[of(0.0, &motions[0])], sets)[0];
+        // Of each motion a part that keeps the limits, and one that does not, each with what is reached.
+        let whole = self.shares(&motions, sets);
+        let mut ends: Vec<((f64, f64), (f64, f64))> = whole.iter().map(|share| ((0.0, rest), (1.0, *share))).collect();
+        for turn in 0..MOST_SCALINGS {
+            let is_open =
+                |k: &usize| ends[*k].1.1 > 1.0 && ends[*k].0.1 < NEAR_LIMIT && ends[*k].1.0 - ends[*k].0.0 > 1e-3;
+            let open: Vec<usize> = (0..motions.len()).filter(is_open).collect();
+            let parts = open.iter().map(|k| {
+                let ((inner, reached), (outer, beyond)) = ends[*k];
+                let secant = (0.5 * (1.0 + NEAR_LIMIT) - reached) / (beyond - reached);
+                let part = if turn % 2 == 0 && secant > 0.0 { secant.clamp(0.02, 0.98) } else { 0.5 };
+                inner + part * (outer - inner)
+            });
+            let parts: Vec<f64> = parts.collect();
+            let tried: Vec<Vec<f64>> = open.iter().zip(&parts).map(|(k, part)| of(*part, &motions[*k])).collect();
+            for ((k, part), share) in open.iter().zip(&parts).zip(self.shares(&tried, sets)) {
+                if share <= 1.0 { ends[*k].0 = (*part, share) } else { ends[*k].1 = (*part, share) }
+            }
+        }
+        let part =
+            |((inner, _), (outer, share)): &((f64, f64), (f64, f64))| if *share <= 1.0 { *outer } else { *inner };
+        motions.iter().zip(&ends).map(|(motion, ends)| of(part(ends), motion)).collect()
+    }
+
+    /// A watched quantity that leaves its limits without motion.
+    fn leaves_at_rest(&self, sets: &[Vec<f64>]) -> Option<&Limit> {
+        if self.watched.is_empty() {
+            return None;
+        }
+        let rest = self.extremes(&[vec![0.0; 2 * self.series.harmonics]], sets).remove(0)?;
+        let limits = self.watched.iter().map(|(limit, _)| limit);
+        limits.zip(rest).find(|(limit, (low, high))| *high > limit.high || *low < limit.low).map(|(limit, _)| limit)
     }
 
     /// What motions promise for each set of values; none where a run fails or an unknown changes nothing.
@@ -315,7 +404,7 @@ impl Design {
 
     /// Minus the criterion of each shape: the mean log-determinant.
     fn judge(&self, shapes: &[Vec<f64>], sets: &[Vec<f64>]) -> Vec<f64> {
-        let motions: Vec<Vec<f64>> = shapes.iter().map(|shape| self.scaled(shape)).collect();
+        let motions = self.kept(shapes.iter().map(|shape| self.scaled(shape)).collect(), sets);
         let mean = |all: Vec<Option<Promise>>| {
             let count = all.len() as f64;
             all.iter().map(|one| one.as_ref().map_or(FAILED, |one| -one.log_determinant)).sum::<f64>() / count
@@ -358,7 +447,9 @@ fn designed(args: &args::Excite, terminal: &mut Terminal) -> Result<End, (String
     let fit = compile::find_fit(&loaded, &name).expect("it has been chosen");
     let series = Series { base: args.base, harmonics: args.harmonics };
     let moves = moves(&loaded, fit, &limits).map_err(failed)?;
-    let text = text(&loaded, fit, (&series, &moves), args).map_err(failed)?;
+    let (limits, watched): (Vec<Limit>, Vec<Limit>) =
+        limits.into_iter().partition(|limit| moves.order(&limit.name).is_some());
+    let text = text(&loaded, fit, (&series, &moves), &watched, args).map_err(failed)?;
     let length = series.period() + args.duration;
     let rows = (length * args.rate).round();
     if rows > MOST_ROWS {
@@ -403,21 +494,35 @@ fn designed(args: &args::Excite, terminal: &mut Terminal) -> Result<End, (String
     };
     let shapes = (0..instants).map(shape).collect();
     let steps = runs.steps();
-    let design = Design { runs, unknowns, series, moves, limits, shapes, noise, steps };
+    // The text has a plot for each of them, in their order.
+    let plots = runs.parts[0].varying.plots.iter().flat_map(|plot| &plot.series).map(|series| series.slot);
+    let watched = watched.into_iter().zip(plots).collect();
+    let design = Design { runs, unknowns, series, moves, limits, watched, shapes, noise, steps };
     let mut sine = vec![0.0; 2 * design.series.harmonics];
     sine[0] = 1.0;
     let sets = match &args.known {
         Some(path) => vec![known(path, &design).map_err(failed)?],
         None => drawn(&design, &scaled, args.seed),
     };
+    if let Some(limit) = design.leaves_at_rest(&sets) {
+        let values = if sets.len() == 1 { "with these values" } else { "for some values in the ranges" };
+        return Err(failed(format!(
+            "--limit: `{}` leaves {} without any motion, {values}; widen the limit{}",
+            limit.name,
+            limit.range(),
+            if args.known.is_some() { "" } else { ", or give values by --known" }
+        )));
+    }
     // A sine may leave an unknown undetermined; all harmonics together are the start of the search.
     let start = vec![1.0; 2 * design.series.harmonics];
     let best = with(|with| {
         let search = Search { step: 0.5, evaluations: args.evaluations, seed: args.seed };
         cma_es::minimise(&start, search, with, &mut |shapes| design.judge(shapes, &sets))
     });
-    let motion = design.scaled(&best.0);
-    let mut promises = design.promises(&[motion.clone(), design.scaled(&sine)], &sets);
+    let mut motions = design.kept(vec![design.scaled(&best.0), design.scaled(&sine)], &sets);
+    let mut promises = design.promises(&motions, &sets);
+    let motion = motions.remove(0);
+    let reached = design.extremes(std::slice::from_ref(&motion), &sets).remove(0).unwrap_or_default();
     let (of_sine, of_best) = (promises.remove(1), promises.remove(0));
     let of_best: Vec<Promise> = of_best.into_iter().flatten().collect();
     if of_best.is_empty() {
@@ -434,7 +539,15 @@ fn designed(args: &args::Excite, terminal: &mut Terminal) -> Result<End, (String
             return Err(failed(format!("cannot write {}: {error}", path.display())));
         }
     }
-    let report = Report { design: &design, best: &of_best, sine: &of_sine, name: &name, args, draws: sets.len() };
+    let report = Report {
+        design: &design,
+        best: &of_best,
+        sine: &of_sine,
+        reached: &reached,
+        name: &name,
+        args,
+        draws: sets.len(),
+    };
     if args.json {
         terminal.line(&report.json(&motion).to_string());
     } else if !args.quiet {
@@ -490,20 +603,18 @@ fn moves(loaded: &Loaded, fit: &ast::Fit, limits: &[Limit]) -> Result<Moves, Str
         let found = quantities.iter().find(|(other, _)| other == name);
         found.map(|(_, unit)| Unit::parse(unit).expect("it is known").dimension)
     };
-    if limits.is_empty() {
-        return Err("a motion needs a limit: `--limit 'x = -2 mm .. 2 mm'`".into());
-    }
     for limit in limits {
-        match known(&limit.name) {
-            Some(dimension) if dimension == limit.unit.dimension => {}
-            Some(dimension) => {
-                return Err(format!("--limit: `{}` is {}, not {}", limit.name, dimension.describe(), limit.unit));
-            }
-            None => {
-                let all = quantities.iter().map(|(name, _)| name.as_str()).collect::<Vec<_>>().join(", ");
-                return Err(format!("--limit: `{}` is not part of the motion; limits are of {all}", limit.name));
-            }
+        if let Some(dimension) = known(&limit.name).filter(|dimension| *dimension != limit.unit.dimension) {
+            return Err(format!("--limit: `{}` is {}, not {}", limit.name, dimension.describe(), limit.unit));
         }
+    }
+    // Other quantities make a motion smaller, from one that is within limits of its own.
+    if limits.iter().all(|limit| known(&limit.name).is_none()) {
+        let all = quantities.iter().map(|(name, _)| name.as_str()).collect::<Vec<_>>().join(", ");
+        return Err(format!(
+            "--limit: what moves needs a limit of its own, as in `--limit '{} = -2 {1} .. 2 {1}'`; it is one of {all}",
+            quantities[0].0, quantities[0].1
+        ));
     }
     Ok(moves)
 }
@@ -550,6 +661,7 @@ fn text(
     loaded: &Loaded,
     fit: &ast::Fit,
     (series, moves): (&Series, &Moves),
+    watched: &[Limit],
     args: &args::Excite,
 ) -> Result<String, String> {
     let slice = |span| loaded.files.slice(span);
@@ -607,6 +719,9 @@ fn text(
                 | ExperimentStatement::Derived(_),
             ) => {}
         }
+    }
+    for Limit { name, unit, .. } in watched {
+        let _ = writeln!(body, "plot {name} [{unit}]");
     }
     let free = coefficients.iter().map(|name| format!("{name} = 0 {unit} in -1e9 {unit} .. 1e9 {unit}"));
     let _ = writeln!(body, "vary {}", free.collect::<Vec<_>>().join(", "));
@@ -743,6 +858,8 @@ struct Report<'a> {
     design: &'a Design,
     best: &'a [Promise],
     sine: &'a [Promise],
+    /// Least and greatest value of each watched quantity.
+    reached: &'a [(f64, f64)],
     name: &'a str,
     args: &'a args::Excite,
     draws: usize,
@@ -814,6 +931,12 @@ impl Report<'_> {
             format!("; of a sine {}", significant(Report::criterion(sine), 3))
         };
         let _ = writeln!(out, "  log det of the information {}{by_sine}", significant(Report::criterion(best), 3));
+        for ((limit, _), (low, high)) in design.watched.iter().zip(self.reached) {
+            let binds = (high / limit.high).max(low / limit.low) >= NEAR_LIMIT;
+            let [low, high] = [*low, *high].map(|end| show(end, &limit.unit, 3));
+            let what = if binds { "the limit" } else { "not the limit; that of another quantity is met first" };
+            let _ = writeln!(out, "  {} reaches {low} .. {high}: {what}", limit.name);
+        }
         if let Some(named) = self.weakest() {
             let _ = writeln!(
                 out,
@@ -843,6 +966,12 @@ impl Report<'_> {
             "log_det": Report::criterion(self.best),
             "sine_log_det": (!self.sine.is_empty()).then(|| Report::criterion(self.sine)),
             "undetermined": self.weakest(),
+            "watched": self.design.watched.iter().zip(self.reached).map(|((limit, _), (low, high))| json!({
+                "name": limit.name,
+                "low": limit.unit.from_si(*low),
+                "high": limit.unit.from_si(*high),
+                "unit": limit.unit.text,
+            })).collect::<Vec<_>>(),
             "base": self.args.base,
             "sines": motion[..self.args.harmonics],
             "cosines": motion[self.args.harmonics..],
