@@ -1,6 +1,7 @@
 #!/bin/sh
-# Design a motion, run it on the rig, fit its log, and predict with the fitted law. Drives are simulated; on a rig, leave
-# out --sim and --fast, and go on with `fric deploy`.
+# Design a motion, run it on the rig, fit its log, predict with the fitted law, and install it on the rig's computer, if
+# RIG names one: `RIG=anna@rig ./chain.sh`, with further options of `fric deploy` in DEPLOY. Drives are simulated; on a rig,
+# leave out --sim and --fast.
 set -eu
 fric=${FRIC:-fric}
 "$fric" excite shaft.fric shaft --for 3s --limit 'v = -1 rad/s .. 1 rad/s' --limit 'a = -20 rad/s^2 .. 20 rad/s^2' \
@@ -10,3 +11,6 @@ fric=${FRIC:-fric}
 # The line to paste ends with the values as options.
 settings=$(grep -o -e "--set '[^']*'" out/shaft.txt | tr '\n' ' ')
 eval "\"$fric\" predict shaft_rig.fric shaft_dry $settings"
+if [ -n "${RIG:-}" ]; then
+  eval "\"$fric\" deploy \"\$RIG\" shaft_rig.fric $settings ${DEPLOY:-}"
+fi

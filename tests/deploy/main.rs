@@ -1,5 +1,5 @@
 //! Packages and their deployment: reproducible builds, refusal of changed bits, deployment over a real sshd on this
-//! machine, rollback, running, and bit-identical replay of the recording.
+//! machine, rollback, running, bit-identical replay of the recording, and the chain of identification that ends there.
 
 #[path = "../support/debian.rs"]
 mod debian;
@@ -7,6 +7,7 @@ mod debian;
 mod emulator;
 #[path = "../support/fric_rig.rs"]
 mod fric_rig;
+mod chain;
 mod fuzz;
 mod package;
 mod ssh;

@@ -91,22 +91,22 @@ impl Drop for Sshd {
 }
 
 /// The rig's computer: reached over ssh, and inspected directly.
-struct There {
+pub struct There {
     folder: PathBuf,
-    dir: PathBuf,
-    host: String,
+    pub dir: PathBuf,
+    pub host: String,
     sshd: Sshd,
 }
 
 impl There {
-    fn new(folder: PathBuf) -> There {
+    pub fn new(folder: PathBuf) -> There {
         let sshd = Sshd::start(&folder);
         let user = String::from_utf8(Command::new("id").arg("-un").output().unwrap().stdout).unwrap();
         There { dir: folder.join("there"), host: format!("{}@127.0.0.1", user.trim()), sshd, folder }
     }
 
     /// `fric deploy HOST …`, `fric fetch-log HOST …`
-    fn words(&self, command: &str, more: &[&str]) -> Vec<String> {
+    pub fn words(&self, command: &str, more: &[&str]) -> Vec<String> {
         let mut all = vec![command.to_string(), self.host.clone()];
         all.extend(more.iter().map(|word| word.to_string()));
         all.extend(self.sshd.options.iter().cloned());
@@ -140,7 +140,7 @@ impl There {
         assert!(output.status.success(), "{what}: {}\n{}", said(&output), self.out());
     }
 
-    fn current(&self) -> Option<PathBuf> {
+    pub fn current(&self) -> Option<PathBuf> {
         fs::read_link(self.dir.join("current")).ok()
     }
 
