@@ -587,6 +587,10 @@ pub struct Fit {
     /// Pieces of the recordings that are also fitted each, to see whether the values drift; 1 for none
     #[arg(long, value_name = "K", default_value_t = PIECES, value_parser = pieces)]
     pub pieces: usize,
+    /// Let differences beyond 1.345 standard deviations count by their size and not by its square (Huber): outliers then
+    /// decide little
+    #[arg(long)]
+    pub robust: bool,
     /// Threads; the answer does not depend on their number [default: one for each processor]
     #[arg(long, value_name = "N", value_parser = threads)]
     pub threads: Option<usize>,

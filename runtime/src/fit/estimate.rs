@@ -6,10 +6,12 @@
 //! by a noise model: first white noise, then twice an autoregressive model of the residuals, with which residuals and
 //! derivatives are whitened and the search continues. Where whitening moves the values further than noise could, the
 //! residuals are no noise, and the estimate remains that of least squares. Derivatives are central differences, of a size that the noise
-//! determines.
+//! determines. A robust fit minimises Huber's loss of the whitened residuals once the minimum has been found; its bounds
+//! follow from the residuals before each search, and are constant while it lasts, so that the loss only falls.
 
 use crate::fit::journal::{Journal, Numbers, Stage, of_list, of_noise};
 use crate::fit::least_squares::{Triangle, singular};
+use crate::fit::loss;
 use crate::fit::noise::Noise;
 use crate::fit::quantiles;
 use crate::fit::sandwich::{Stretch, scatter};
@@ -107,6 +109,8 @@ pub struct Question<'a> {
     pub seed: u64,
     /// How the values are estimated.
     pub estimator: Estimator,
+    /// Whether large residuals count by their size and not by its square.
+    pub robust: bool,
     /// Keeps the stages of the search, and gives those of an earlier one.
     pub journal: Option<&'a mut (dyn Journal + 'a)>,
 }
@@ -192,6 +196,8 @@ const PART_OF_NOISE: f64 = 0.3;
 const LEAST_SENSITIVITY: f64 = 4.0;
 /// Relative difference of two columns above which they disagree.
 const ROUGH: f64 = 0.05;
+/// Searches of a robust fit before the noise is modelled, each with bounds from what the one before left.
+const ROBUST_ROUNDS: u32 = 3;
 /// Rounds of weights for several items of unknown noise.
 const MOST_ROUNDS: u32 = 6;
 /// Starts that are run at once: their residuals are in memory together.
@@ -222,7 +228,7 @@ const NO_NOISE: f64 = 1e-3;
 ///
 /// # Errors Why there is no answer.
 pub fn fit(question: Question) -> Result<Answer, Trouble> {
-    let Question { unknowns, items, minima, run, finer, with, level, limits, starts, seed, estimator, journal } =
+    let Question { unknowns, items, minima, run, finer, with, level, limits, starts, seed, estimator, robust, journal } =
         question;
     let n = unknowns.len();
     assert!(n > 0 && !items.is_empty(), "{n} unknowns, {} items", items.len());
@@ -233,6 +239,7 @@ pub fn fit(question: Question) -> Result<Answer, Trouble> {
         run,
         way: Way::Whole,
         prior: None,
+        robust: false,
         low: low.clone(),
         high: high.clone(),
         noise: items.iter().map(|item| Noise::white(item.sd.map_or(1.0, |sd| sd * sd))).collect(),
@@ -272,8 +279,13 @@ pub fn fit(question: Question) -> Result<Answer, Trouble> {
     // Of equal ends the first one: in a flat valley, that of the written start.
     let least = ends.iter().map(|end| end.misfit).fold(f64::INFINITY, f64::min);
     let best = ends.into_iter().find(|end| end.misfit - least <= EQUAL_END);
-    let Some(Followed { mut x, why, noise, .. }) = best else { return Err(Trouble::NoStart(search.commonest())) };
+    let Some(Followed { mut x, mut why, noise, .. }) = best else { return Err(Trouble::NoStart(search.commonest())) };
     search.noise = noise;
+    search.robust = robust;
+    for _ in 0..if robust { ROBUST_ROUNDS } else { 0 } {
+        let Some(found) = search.again(items, &x, (&low, &high), false, limits)? else { break };
+        (x, why) = (found.x, found.why);
+    }
     // A model error that a bound causes looks like correlated noise, in which the parameter would leave the bound.
     let (mut from, mut to) = (low.clone(), high.clone());
     for k in 0..n {
@@ -292,17 +304,7 @@ pub fn fit(question: Question) -> Result<Answer, Trouble> {
     let plain = (x.clone(), search.noise.clone());
     // Twice: a noise model of the residuals, and on from there.
     for _ in 0..2 {
-        let stage = search.staged(|search| {
-            let residuals = search.residuals(&x).map_err(Trouble::NoStart)?;
-            search.weigh(items, &residuals, true);
-            let found = minimise(&x, &from, &to, search, limits);
-            Ok(Followed { x: found.x, why: found.why, noise: search.noise.clone(), misfit: found.cost }.numbers())
-        })?;
-        let Some(found) = Followed::read(&stage) else { break };
-        search.noise = found.noise;
-        if found.why == Ended::NoStart {
-            break;
-        }
+        let Some(found) = search.again(items, &x, (&from, &to), true, limits)? else { break };
         x = found.x;
         outcome.why = found.why;
     }
@@ -406,6 +408,8 @@ struct Search<'a> {
     way: Way,
     /// In a stage of a path: each coordinate is expected within one unit of this point.
     prior: Option<Vec<f64>>,
+    /// Large residuals count by their size.
+    robust: bool,
     low: Vec<f64>,
     high: Vec<f64>,
     noise: Vec<Noise>,
@@ -604,16 +608,42 @@ impl Search<'_> {
         unreachable!("the rounds end")
     }
 
+    /// Searches on from `x`, within these bounds, under a model of the noise there. None if it cannot be run around it.
+    fn again(
+        &mut self,
+        items: &[Item],
+        x: &[f64],
+        (low, high): (&[f64], &[f64]),
+        correlated: bool,
+        limits: Limits,
+    ) -> Result<Option<Followed>, Trouble> {
+        let stage = self.staged(|search| {
+            let residuals = search.residuals(x).map_err(Trouble::NoStart)?;
+            search.weigh(items, &residuals, correlated);
+            let found = minimise(x, low, high, search, limits);
+            Ok(Followed { x: found.x, why: found.why, noise: search.noise.clone(), misfit: found.cost }.numbers())
+        })?;
+        let Some(found) = Followed::read(&stage) else { return Ok(None) };
+        self.noise.clone_from(&found.noise);
+        Ok(Some(found).filter(|found| found.why != Ended::NoStart))
+    }
+
     /// A model of the noise of each item from its residuals.
     fn noise_of(&self, items: &[Item], residuals: &Residuals, correlated: bool) -> Vec<Noise> {
         let one = |(item, residuals): (&Item, &Vec<f64>)| {
-            let mean = mean_square(residuals);
+            // Where most residuals are 0 none is an outlier.
+            let robust = Some(loss::deviation(residuals)).filter(|sd| self.robust && *sd > 0.0);
+            let mean = robust.map_or_else(|| mean_square(residuals), |sd| sd * sd);
+            let most = robust.map_or(f64::INFINITY, |sd| loss::SOUND * sd);
             let noise = match &item.rows {
-                Rows::Even(gaps) if correlated => Noise::of(residuals, gaps, &self.scale.with),
+                Rows::Even(gaps) if correlated => Noise::of(residuals, gaps, most, &self.scale.with),
                 Rows::Even(_) | Rows::Independent | Rows::Uneven => Noise::white(mean),
             };
             // Data that a model fits exactly have no noise to weigh by.
-            Noise { variance: item.sd.map_or(mean.max(f64::MIN_POSITIVE), |sd| sd * sd), ..noise }
+            let variance = item.sd.map_or(mean.max(f64::MIN_POSITIVE), |sd| sd * sd);
+            let noise = Noise { variance, ..noise };
+            let bound = robust.map_or(f64::INFINITY, |_| loss::BOUND * loss::deviation(&noise.whitened(residuals)));
+            Noise { bound: if bound > 0.0 { bound } else { f64::INFINITY }, ..noise }
         };
         items.iter().zip(residuals).map(one).collect()
     }
@@ -638,6 +668,29 @@ impl Search<'_> {
         all.extend(known);
         all.extend(self.prior.iter().flat_map(|prior| x.iter().zip(prior).map(|(x, prior)| x - prior)));
         all
+    }
+
+    /// The bounds of whitened residuals; what is known beforehand has none.
+    fn bounds(&self, residuals: &Residuals) -> impl Iterator<Item = f64> {
+        let one = |(noise, rows): (&Noise, &Vec<f64>)| std::iter::repeat_n(noise.bound, noise.kept(rows.len()).count());
+        let all: Vec<_> = self.noise.iter().zip(residuals).map(one).collect();
+        all.into_iter().flatten().chain(std::iter::repeat(f64::INFINITY))
+    }
+
+    /// The loss of whitened residuals: their sum of squares, in least squares.
+    fn loss(&self, white: &[f64], residuals: &Residuals) -> f64 {
+        white.iter().zip(self.bounds(residuals)).map(|(r, bound)| loss::loss(*r, bound)).sum()
+    }
+
+    /// Weighs rows of the Jacobian and of the whitened residuals, so that they have the gradient of the loss.
+    fn weighted(&self, columns: &mut [Vec<f64>], white: &mut [f64], residuals: &Residuals) {
+        if self.robust {
+            for (row, bound) in (0..white.len()).zip(self.bounds(residuals)) {
+                let weight = loss::root_weight(white[row], bound);
+                white[row] *= weight;
+                columns.iter_mut().for_each(|column| column[row] *= weight);
+            }
+        }
     }
 
     /// Columns of the Jacobian of the whitened residuals, by differences of these sizes; none if the model cannot be run
@@ -696,11 +749,14 @@ impl Search<'_> {
         };
         let found = at(x).and_then(|moved| Some((moved, at(plain)?)));
         let is_larger = found.is_some_and(|(moved, residuals)| {
-            let (white, moved) = (self.white(plain, &residuals), self.white(x, &moved));
+            let mut white = self.white(plain, &residuals);
             let square = |rows: &[f64]| rows.iter().map(|r| r * r).sum::<f64>();
             let degrees = (white.len() as f64 - n as f64).max(1.0);
-            let rise = (square(&moved) - square(&white)) / (square(&white) / degrees);
-            let Some(columns) = self.columns(plain, 1.0).filter(|_| rise > 0.0) else { return false };
+            let rise = self.loss(&self.white(x, &moved), &moved) - self.loss(&white, &residuals);
+            let Some(mut columns) = self.columns(plain, 1.0).filter(|_| rise > 0.0) else { return false };
+            self.weighted(&mut columns, &mut white, &residuals);
+            // In units of the variance of the rows.
+            let rise = rise / (square(&white) / degrees);
             // What is at a bound does not scatter.
             let free = (0..n).filter(|k| self.at_bound(plain, *k).is_none());
             let columns: Vec<Vec<f64>> = free.map(|k| columns[k].clone()).collect();
@@ -756,20 +812,47 @@ impl Search<'_> {
             }
         };
         let white = self.white(x, &residuals);
+        let mut stretches = self.stretches(items, &residuals);
+        let uneven = items.iter().any(|item| item.rows == Rows::Uneven);
+        let scatters = misfits || uneven;
+        let moments: Vec<loss::Moments> = match self.robust {
+            true => {
+                let of =
+                    |(stretch, noise): (&Stretch, &Noise)| loss::moments(&white, stretch.rows.clone(), noise.bound, n);
+                stretches.iter().zip(&self.noise).map(of).collect()
+            }
+            false => Vec::new(),
+        };
+        // Rows within their bound alone curve the loss: on average this part of each.
+        let mut columns = columns;
+        for one in &moments {
+            let root = one.within.sqrt();
+            columns.iter_mut().for_each(|column| column[one.rows.clone()].iter_mut().for_each(|cell| *cell *= root));
+        }
         let triangle = reduced(&columns, &white);
         let degrees = (white.len() as f64 - n as f64).max(1.0);
         let chi_square = triangle.square() / degrees;
         // Where a standard deviation is given, it is not estimated again.
-        let variance = if items.iter().any(|item| item.sd.is_some()) { 1.0 } else { chi_square };
+        let given = self.robust || items.iter().any(|item| item.sd.is_some());
+        let variance = if given { 1.0 } else { chi_square };
         let of_r = |k: usize| (0..n).map(|row| triangle.r[row * n + k]).collect::<Vec<f64>>();
         let parts = singular((0..n).map(of_r).collect(), &triangle.qf);
         let model = |i: usize, j: usize| -> f64 {
             let each = parts.values.iter().zip(&parts.vectors);
             each.map(|(s, v)| variance * (v[i] / s) * (v[j] / s)).sum()
         };
-        // Where no model makes the noise white, the scatter of the gradient takes its place.
-        let uneven = items.iter().any(|item| item.rows == Rows::Uneven);
-        let scattered = (misfits || uneven).then(|| scatter(&columns, &white, &self.stretches(items, &residuals)));
+        // Where no model makes the noise white, the scatter of the gradient takes its place. Huber's loss has a sandwich in
+        // any case (Robust Statistics, sec. 7.6): the rows of the gradient are those of half the loss's slope, of which
+        // independent ones count by their mean square.
+        let mut sloped = white.clone();
+        for (one, noise) in moments.iter().zip(&self.noise) {
+            let root = one.within.sqrt();
+            let mean = one.square.sqrt() / root;
+            let slope = |r: f64| if scatters { r.clamp(-noise.bound, noise.bound) / root } else { mean };
+            sloped[one.rows.clone()].iter_mut().for_each(|r| *r = slope(*r));
+        }
+        stretches.iter_mut().for_each(|stretch| stretch.independent |= !scatters);
+        let scattered = (scatters || self.robust).then(|| scatter(&columns, &sloped, &stretches));
         let small_sample = white.len() as f64 / degrees;
         // Of the combinations of singular vectors i and j.
         let ratios: Option<Vec<f64>> = scattered.as_ref().map(|scattered| {
@@ -785,7 +868,8 @@ impl Search<'_> {
             Some(ratios) => ratios[a * n + a].sqrt() / (parts.values[a] * parts.values[a]),
             None => variance.sqrt() / parts.values[a],
         };
-        let inflation = |k: usize| if ratios.is_some() { (covariance(k, k) / model(k, k)).max(1.0) } else { 1.0 };
+        let least = if self.robust { 0.0 } else { 1.0 };
+        let inflation = |k: usize| if ratios.is_some() { (covariance(k, k) / model(k, k)).max(least) } else { 1.0 };
         let inflation = (0..n).map(inflation).collect();
         let values = self.values(x);
         let unknowns = self.scale.unknowns;
@@ -800,7 +884,11 @@ impl Search<'_> {
         let sd: Vec<f64> = (0..n).map(|k| covariance(k, k).sqrt()).collect();
         // Other residuals move the minimum by −(JᵀJ)⁻¹Jᵀ of their change (Gauss and Newton).
         let moved = |residuals: &Residuals| -> Vec<f64> {
-            let change: Vec<f64> = self.white(x, residuals).iter().zip(&white).map(|(a, b)| a - b).collect();
+            let mut change: Vec<f64> = self.white(x, residuals).iter().zip(&white).map(|(a, b)| a - b).collect();
+            for (one, noise) in moments.iter().zip(&self.noise) {
+                let counts = |row: usize| if white[row].abs() <= noise.bound { 1.0 / one.within.sqrt() } else { 0.0 };
+                one.rows.clone().for_each(|row| change[row] *= counts(row));
+            }
             let parts = singular((0..n).map(of_r).collect(), &reduced(&columns, &change).qf);
             let weights: Vec<f64> =
                 parts.values.iter().zip(&parts.uf).map(|(s, uf)| if *s > 0.0 { uf / s } else { 0.0 }).collect();
@@ -894,17 +982,19 @@ fn reduced(columns: &[Vec<f64>], f: &[f64]) -> Triangle {
 impl Objective for Search<'_> {
     fn cost(&mut self, x: &[f64]) -> Option<f64> {
         let residuals = self.residuals(x).ok()?;
-        let cost = 0.5 * self.white(x, &residuals).iter().map(|r| r * r).sum::<f64>();
+        let cost = 0.5 * self.loss(&self.white(x, &residuals), &residuals);
         cost.is_finite().then_some(cost)
     }
 
     fn linearise(&mut self, x: &[f64]) -> Option<Triangle> {
         let residuals = self.residuals(x).ok()?;
-        let columns = self.columns(x, 1.0)?;
+        let mut columns = self.columns(x, 1.0)?;
         self.size(&columns);
         // Runs around `x` have replaced the last point.
         self.last = Some((x.to_vec(), residuals.clone()));
-        Some(reduced(&columns, &self.white(x, &residuals)))
+        let mut white = self.white(x, &residuals);
+        self.weighted(&mut columns, &mut white, &residuals);
+        Some(reduced(&columns, &white))
     }
 }
 
@@ -958,6 +1048,7 @@ mod tests {
             starts: 1,
             seed: 0,
             estimator: Estimator::Chosen,
+            robust: false,
             journal: None,
         })
     }
@@ -1037,6 +1128,7 @@ mod tests {
                     starts,
                     seed,
                     estimator: Estimator::Chosen,
+                    robust: false,
                     journal: None,
                 };
                 let answer = fit(question).unwrap();
@@ -1098,6 +1190,7 @@ mod tests {
                     run: &mut run,
                     way: Way::Whole,
                     prior: None,
+                    robust: false,
                     low,
                     high,
                     noise: vec![Noise::white(1.0)],
@@ -1171,6 +1264,7 @@ mod tests {
             starts: 1,
             seed: 0,
             estimator: Estimator::Chosen,
+            robust: false,
             journal: None,
         };
         assert_eq!(fit(question), Err(Trouble::NoInfluence(vec![1])));
@@ -1188,6 +1282,7 @@ mod tests {
             starts: 1,
             seed: 0,
             estimator: Estimator::Chosen,
+            robust: false,
             journal: None,
         };
         assert_eq!(fit(question), Err(Trouble::NoStart("too many steps".into())));
@@ -1219,6 +1314,7 @@ mod tests {
                 starts: 16,
                 seed,
                 estimator: Estimator::Chosen,
+                robust: false,
                 journal: None,
             });
             let answer = answer.unwrap_or_else(|trouble| panic!("seed {seed}: {trouble:?}"));
@@ -1249,6 +1345,16 @@ mod tests {
 
     /// A question about one compared quantity.
     fn asked(unknowns: &[Unknown], rows: Rows, starts: usize, residuals: &dyn Fn(&[f64]) -> Vec<f64>) -> Answer {
+        asked_so(unknowns, rows, starts, false, residuals)
+    }
+
+    fn asked_so(
+        unknowns: &[Unknown],
+        rows: Rows,
+        starts: usize,
+        robust: bool,
+        residuals: &dyn Fn(&[f64]) -> Vec<f64>,
+    ) -> Answer {
         let mut run = |_: Way, points: &[Vec<f64>]| {
             points.iter().map(|p| Ok(vec![residuals(p)])).collect::<Vec<Result<Residuals, String>>>()
         };
@@ -1264,6 +1370,7 @@ mod tests {
             starts,
             seed: 0,
             estimator: Estimator::Chosen,
+            robust,
             journal: None,
         })
         .expect("it has an answer")
@@ -1329,6 +1436,39 @@ mod tests {
         assert!(held.iter().all(|held| (176..=200).contains(held)), "of 200: {held:?}");
     }
 
+    /// Intervals of robust fits hold the truth as often as they say, of normal noise and with a tenth of outliers, also where
+    /// the noise is correlated.
+    ///
+    /// Mutants, each fails: the mean square of the slope is 1; the part within the bound is 1.
+    #[test]
+    fn intervals_of_robust_fits_hold_the_truth() {
+        for (kind, rho, share) in [("normal", 0.0, 0.0), ("outliers", 0.0, 0.1), ("correlated", 0.8, 0.03)] {
+            let (mut held, mut wide) = ([0; 2], 0.0);
+            for seed in 0..200 {
+                let (mut chance, mut past) = (Chance(seed), 0.0);
+                let slow: Vec<f64> = (0..600).map(|t| (0.02 * f64::from(t)).sin()).collect();
+                let data: Vec<f64> = (0..600)
+                    .map(|t| {
+                        past = rho * past + f64::sqrt(1.0 - rho * rho) * normal(&mut chance);
+                        let outlier = if chance.fraction() < share { 40.0 * (chance.fraction() - 0.5) } else { 0.0 };
+                        2.0 * slow[t] - 0.5 + 0.1 * (past + outlier)
+                    })
+                    .collect();
+                let functions = [slow, vec![1.0; 600]];
+                let left = |p: &[f64]| linear(&functions, &data, p);
+                let [answer, plain] =
+                    [true, false].map(|robust| asked_so(&[PLAIN; 2], Rows::Even(vec![]), 1, robust, &left));
+                wide += plain.sd[0] / answer.sd[0] / 200.0;
+                for (held, ((low, high), truth)) in held.iter_mut().zip(answer.intervals.iter().zip([2.0, -0.5])) {
+                    *held += u32::from((*low..=*high).contains(&truth));
+                }
+            }
+            // Binomial: 190 ± 3 of 200.
+            assert!(held.iter().all(|held| (178..=199).contains(held)), "{kind}: {held:?} of 200");
+            assert!(if share > 0.05 { wide > 2.0 } else { wide > 0.9 }, "{kind}: {wide}");
+        }
+    }
+
     /// Of a linear model the shift is that of a fit with the other residuals, in standard deviations.
     #[test]
     fn shifts_are_those_of_a_fit_with_the_other_residuals() {
@@ -1357,6 +1497,7 @@ mod tests {
                 starts: 1,
                 seed,
                 estimator: Estimator::Chosen,
+                robust: false,
                 journal: None,
             });
             let answer = answer.expect("it has an answer");

@@ -49,9 +49,10 @@ impl Numbers<'_> {
 
     /// A model of noise, as [`of_noise`] writes it.
     pub fn noise(&mut self) -> Option<Noise> {
-        let (variance, innovation) = (self.one()?, self.one()?);
+        let (variance, innovation, bound) = (self.one()?, self.one()?, self.one()?);
         let (coefficients, gaps) = (self.list()?, self.list()?);
-        Some(Noise { coefficients, variance, innovation, gaps: gaps.into_iter().map(|row| row as usize).collect() })
+        let gaps = gaps.into_iter().map(|row| row as usize).collect();
+        Some(Noise { coefficients, variance, innovation, gaps, bound })
     }
 }
 
@@ -63,5 +64,5 @@ pub fn of_list(list: &[f64]) -> Vec<f64> {
 /// A model of noise as numbers.
 pub fn of_noise(noise: &Noise) -> Vec<f64> {
     let gaps: Vec<f64> = noise.gaps.iter().map(|row| *row as f64).collect();
-    [vec![noise.variance, noise.innovation], of_list(&noise.coefficients), of_list(&gaps)].concat()
+    [vec![noise.variance, noise.innovation, noise.bound], of_list(&noise.coefficients), of_list(&gaps)].concat()
 }

@@ -8,6 +8,7 @@ pub mod unknowns;
 pub mod quantiles;
 pub mod least_squares;
 pub mod trust_region;
+pub mod loss;
 pub mod noise;
 pub mod sandwich;
 pub mod journal;

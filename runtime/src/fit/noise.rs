@@ -20,24 +20,39 @@ pub struct Noise {
     pub innovation: f64,
     /// Rows before which there is a gap, ascending: no row after it follows from those before it.
     pub gaps: Vec<usize>,
+    /// Whitened residuals beyond this count by their size and not by its square (Huber); infinite in least squares.
+    pub bound: f64,
 }
 
 impl Noise {
     /// White noise of this variance.
     pub fn white(variance: f64) -> Noise {
-        Noise { coefficients: Vec::new(), variance, innovation: 1.0, gaps: Vec::new() }
+        Noise { coefficients: Vec::new(), variance, innovation: 1.0, gaps: Vec::new(), bound: f64::INFINITY }
     }
 
-    /// The model of these residuals, with gaps before these rows.
-    pub fn of(residuals: &[f64], gaps: &[usize], with: &Elementary) -> Noise {
-        let n = residuals.len();
-        let variance = residuals.iter().map(|r| r * r).sum::<f64>() / n.max(1) as f64;
+    /// The model of these residuals, with gaps before these rows, from those whose size is at most `most`.
+    pub fn of(residuals: &[f64], gaps: &[usize], most: f64, with: &Elementary) -> Noise {
+        let is_sound = |r: &f64| r.abs() <= most;
+        let n = residuals.iter().filter(|r| is_sound(r)).count();
+        let variance = residuals.iter().filter(|r| is_sound(r)).map(|r| r * r).sum::<f64>() / n.max(1) as f64;
         let mut noise = Noise { gaps: gaps.to_vec(), ..Noise::white(variance) };
         if variance <= 0.0 || variance.is_nan() {
             return noise;
         }
         let most = MOST_ORDER.min(n / 10);
-        let stretches = noise.stretches(n);
+        // An outlier parts its neighbours as a gap does.
+        let whole = noise.stretches(residuals.len());
+        let sound = |rows: &Range<usize>| {
+            let parts = residuals[rows.clone()].split_inclusive(|r| !is_sound(r));
+            let mut begin = rows.start;
+            let one = |part: &[f64]| {
+                let from = begin;
+                begin += part.len();
+                from..from + part.iter().filter(|r| is_sound(r)).count()
+            };
+            parts.map(one).collect::<Vec<Range<usize>>>()
+        };
+        let stretches: Vec<Range<usize>> = whole.iter().flat_map(sound).collect();
         let (mut forward, mut backward) = (residuals.to_vec(), residuals.to_vec());
         let (mut a, mut power): (Vec<f64>, f64) = (Vec::new(), 1.0);
         let criterion = |power: f64, order: usize| n as f64 * (with.log)(power) + order as f64 * (with.log)(n as f64);
@@ -120,7 +135,7 @@ mod tests {
                 let past: f64 = a.iter().enumerate().filter(|(k, _)| t > *k).map(|(k, a)| a * series[t - 1 - k]).sum();
                 series.push(past + normal(&mut chance));
             }
-            let noise = Noise::of(&series, &[], &PLATFORM);
+            let noise = Noise::of(&series, &[], f64::INFINITY, &PLATFORM);
             assert_eq!(noise.order(), a.len(), "{a:?}: {noise:?}");
             for (found, expected) in noise.coefficients.iter().zip(&a) {
                 assert!((found - expected).abs() < 0.03, "{a:?}: {noise:?}");
@@ -129,14 +144,14 @@ mod tests {
             let variance = white.iter().map(|e| e * e).sum::<f64>() / white.len() as f64;
             assert!((variance - 1.0).abs() < 1e-3, "{a:?}: variance {variance}");
             assert!((noise.variance * noise.innovation - 1.0).abs() < 0.04, "{a:?}: {noise:?}");
-            assert!(Noise::of(&white, &[], &PLATFORM).order() == 0, "{a:?}: white after the filter");
+            assert!(Noise::of(&white, &[], f64::INFINITY, &PLATFORM).order() == 0, "{a:?}: white after the filter");
         }
     }
 
     #[test]
     fn nothing_and_constants_are_white() {
         for series in [vec![], vec![0.0; 50], vec![1.0; 3]] {
-            assert_eq!(Noise::of(&series, &[], &PLATFORM).order(), 0, "{series:?}");
+            assert_eq!(Noise::of(&series, &[], f64::INFINITY, &PLATFORM).order(), 0, "{series:?}");
         }
     }
 
@@ -155,7 +170,7 @@ mod tests {
                     series.push(past);
                 }
             }
-            let [noise, forgotten] = [&gaps[1..], &[]].map(|gaps| Noise::of(&series, gaps, &PLATFORM));
+            let [noise, forgotten] = [&gaps[1..], &[]].map(|gaps| Noise::of(&series, gaps, f64::INFINITY, &PLATFORM));
             let mean = |noise: &Noise| {
                 let white = noise.whitened(&series);
                 noise.variance * noise.innovation * white.iter().map(|e| e * e).sum::<f64>() / white.len() as f64

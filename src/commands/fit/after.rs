@@ -7,6 +7,7 @@
 use super::search::{Found, Part, Runs, Settings, estimate};
 use crate::compile::ElementaryFunction;
 use abi::unit::Unit;
+use runtime::fit::loss::loss;
 use runtime::fit::ranking;
 use runtime::fit::statistics::{self, Dependence, Outliers};
 use runtime::fit::{Answer, Elementary, Item, Limits, Noise, Residuals, Trouble, Unknown, Way};
@@ -179,9 +180,14 @@ pub fn misfit(runs: &Runs, (noise, residuals): (&[Noise], &Residuals), values: &
     let of = |(k, item): (usize, &crate::compile::FitItem)| {
         let (noise, residuals) = (&noise[k], &residuals[k]);
         let n = residuals.len() as f64;
+        let square = || noise.whitened(residuals).iter().map(|r| loss(*r, noise.bound)).sum::<f64>();
         with(|with| match item.sd {
-            Some(_) => noise.whitened(residuals).iter().map(|r| r * r).sum::<f64>() + n * (with.log)(noise.innovation),
-            None => n * (with.log)((noise.variance * noise.innovation).max(f64::MIN_POSITIVE)),
+            Some(_) => square() + n * (with.log)(noise.innovation),
+            // Of least squares the sum is the number of rows.
+            None => {
+                let square = if noise.bound.is_finite() { square() } else { 0.0 };
+                square + n * (with.log)((noise.variance * noise.innovation).max(f64::MIN_POSITIVE))
+            }
         })
     };
     let known = runs.unknowns.iter().zip(values).filter_map(|(unknown, value)| {
@@ -280,7 +286,9 @@ fn rise(
     for (at, other) in free.iter().enumerate() {
         base[*other] = found.values[at];
     }
-    misfit(runs, (&found.weights, &found.residuals), base)
+    // A deviation from the median is no minimum of the loss: that of the answer counts.
+    let weights = if settings.robust { &answer.weights } else { &found.weights };
+    misfit(runs, (weights, &found.residuals), base)
 }
 
 /// The misfit with these values, under the noise model of the answer.
@@ -294,7 +302,9 @@ fn alone(runs: &Runs, answer: &Answer, values: &[f64], steps: &[f64]) -> Option<
     let noise: Vec<Noise> = answer.weights.iter().zip(&residuals).map(scaled).collect();
     let known: Vec<bool> = runs.parts.iter().flat_map(|part| &part.asks.items).map(|item| item.sd.is_some()).collect();
     let noise = noise.into_iter().zip(&answer.weights).zip(known);
-    let noise: Vec<Noise> = noise.map(|((new, old), known)| if known { old.clone() } else { new }).collect();
+    let keeps = |old: &Noise, known: bool| known || old.bound.is_finite();
+    let noise: Vec<Noise> =
+        noise.map(|((new, old), known)| if keeps(old, known) { old.clone() } else { new }).collect();
     Some(misfit(runs, (&noise, &residuals), values))
 }
 

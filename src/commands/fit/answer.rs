@@ -9,6 +9,7 @@ use crate::terminal::Terminal;
 use abi::plan::Solver;
 use abi::unit::Unit;
 use grammar::diagnostic::Diagnostic;
+use runtime::fit::loss::deviation;
 use runtime::fit::ranking::Paired;
 use runtime::fit::statistics::{Dependence, gaps};
 use runtime::fit::{Answer, Combination, Ended};
@@ -285,7 +286,9 @@ impl Fitted {
                     let warning = Diagnostic::warning("W0907", message).label(runs.name, said(&alone, part));
                     all.push((
                         "outliers",
-                        warning.help("look at them; leave them out with `after` and `before`, or remove the rows"),
+                        warning.help(
+                            "look at them; leave them out with `after` and `before`, remove the rows, or let them count less with `--robust`",
+                        ),
                     ));
                 }
                 if remarks.begins_badly {
@@ -418,7 +421,9 @@ impl Fitted {
                 };
                 let rms = show(answer.rms[k], &item.unit, 4);
                 let no_noise = if answer.misfits && noise.order() > 0 { ", no noise" } else { "" };
-                out += &format!("{indent}rms({})  {rms}, {colour}{no_noise}{of_given}\n", item.shown());
+                let robust = robust_deviation(answer, k)
+                    .map_or(String::new(), |sd| format!(", robust {}", show(sd, &item.unit, 4)));
+                out += &format!("{indent}rms({})  {rms}{robust}, {colour}{no_noise}{of_given}\n", item.shown());
             }
             out += &results::verdicts(terminal, &run.verdicts, None, None, indent);
         }
@@ -524,6 +529,7 @@ impl Fitted {
             json!({
                 "text": item.shown(),
                 "rms": width(&item.unit, answer.rms[k]),
+                "robust_sd": robust_deviation(answer, k).map(|sd| width(&item.unit, sd)),
                 "given_sd": item.sd.map(|sd| width(&item.unit, sd)),
                 "unit": item.unit.text,
                 "rows": answer.residuals[k].len(),
@@ -585,6 +591,7 @@ impl Fitted {
             "correlation": (0..n).map(row).collect::<Vec<_>>(),
             "undetermined": open,
             "no_noise": answer.misfits,
+            "robust": answer.noise.iter().any(|noise| noise.bound.is_finite()),
             "chi_square": number(answer.chi_square),
             "degrees_of_freedom": number(answer.degrees),
             "rank": self.rank.as_ref().map(|rank| rank.rank),
@@ -628,6 +635,11 @@ fn change(open: &Combination, k: usize, unknown: &FitUnknown) -> Option<String> 
         true => format!("{name} / {}", significant(ElementaryFunction::exp().at(size), 2)),
         false => format!("{name} {sign} {}", show(size * (high - low), &unknown.unit, 2)),
     })
+}
+
+/// The standard deviation of the residuals of a compared quantity by their median, where large ones count by their size.
+fn robust_deviation(answer: &Answer, k: usize) -> Option<f64> {
+    answer.noise[k].bound.is_finite().then(|| deviation(&answer.residuals[k]))
 }
 
 fn rms(rows: &[f64]) -> f64 {

@@ -83,6 +83,7 @@ fn asked(args: &args::Fit, loaded: &Loaded, name: &str, compiled: &[compile::Fit
         ("tol", args.tol.map(|tol| tol.to_string())),
         ("starts", args.starts.map(|starts| starts.to_string())),
         ("profile", (!args.profile.is_empty()).then(|| args.profile.join(","))),
+        ("robust", args.robust.then(String::new)),
         ("interpret", args.interpret.then(String::new)),
     ] {
         if let Some(value) = value {

@@ -476,6 +476,8 @@ pub struct Settings {
     pub seed: u64,
     /// How the values are estimated.
     pub estimator: Estimator,
+    /// Whether large residuals count by their size.
+    pub robust: bool,
     /// When a search ends.
     pub limits: Limits,
 }
@@ -483,12 +485,12 @@ pub struct Settings {
 impl Settings {
     /// Those that nothing changes.
     pub fn new(level: f64) -> Settings {
-        Settings { level, starts: None, seed: 0, estimator: Estimator::Chosen, limits: LIMITS }
+        Settings { level, starts: None, seed: 0, estimator: Estimator::Chosen, robust: false, limits: LIMITS }
     }
 
     /// As the command line states it.
     pub fn of(args: &args::Fit) -> Settings {
-        Settings { starts: args.starts, seed: args.seed, ..Settings::new(args.level) }
+        Settings { starts: args.starts, seed: args.seed, robust: args.robust, ..Settings::new(args.level) }
     }
 
     /// The same, with estimates like those of an answer.
@@ -536,6 +538,7 @@ pub(super) fn estimate(
         starts: settings.starts.unwrap_or(if runs.minima().regimes { STARTS_WITH_REGIMES } else { STARTS }),
         seed: settings.seed,
         estimator: settings.estimator,
+        robust: settings.robust,
     })
 }
 
