@@ -980,7 +980,9 @@ fn values_are_those_of_peers() {
         let (who, numbers) = line.split_once(' ').unwrap();
         let numbers: Vec<f64> = numbers.split(' ').map(|number| number.parse().unwrap()).collect();
         let (seed, robust) = (numbers[0] as u64, who == "huber");
-        for (solver, most) in [("", 0.1), ("solver expo step 10 us", if robust { 1e-2 } else { 1e-3 })] {
+        // The shortest steps take long.
+        let fine = [("", 0.1), ("solver expo step 10 us", if robust { 1e-2 } else { 1e-3 })];
+        for (solver, most) in fine.into_iter().take(if seed == 0 { 2 } else { 1 }) {
             let mut chance = Chance(seed);
             let share = if robust { 0.05 } else { 0.0 };
             let noise = &mut || {
