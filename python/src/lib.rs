@@ -11,6 +11,7 @@ mod watched;
 mod text;
 mod native;
 mod stepper;
+mod calls;
 mod batch;
 mod sweep;
 
@@ -102,6 +103,7 @@ mod _fric {
     #[pymodule_init]
     fn init(module: &Bound<'_, PyModule>) -> PyResult<()> {
         fric::limit_lanes().map_err(PyValueError::new_err)?;
+        crate::calls::add(module.py())?;
         module.add("__version__", env!("CARGO_PKG_VERSION"))
     }
 }

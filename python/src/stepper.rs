@@ -19,6 +19,9 @@ use runtime::engine;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
+/// An argument.
+pub type Given<'a, 'py> = Borrowed<'a, 'py, PyAny>;
+
 /// What does not change while it runs.
 pub struct Plan {
     text: Py<Text>,
@@ -32,17 +35,6 @@ pub struct Plan {
     pub inputs: Vec<(String, Slot)>,
     /// Those of the results.
     pub outputs: Vec<(String, Slot)>,
-}
-
-/// An argument that may be left out. The first ones of a call are taken without making a tuple of them.
-struct Given<'a, 'py>(Option<Borrowed<'a, 'py, PyAny>>);
-
-impl<'a, 'py> FromPyObject<'a, 'py> for Given<'a, 'py> {
-    type Error = PyErr;
-
-    fn extract(given: Borrowed<'a, 'py, PyAny>) -> PyResult<Given<'a, 'py>> {
-        Ok(Given(Some(given)))
-    }
 }
 
 impl Plan {
@@ -295,45 +287,6 @@ impl Stepper {
         started.checked(py)?;
         let Started { plan, program, instance, status } = started;
         Ok(Stepper { plan, set, program, instance, follow: None, status })
-    }
-
-    /// One step with these inputs; returns the outputs.
-    #[pyo3(
-        signature = (first=Given(None), second=Given(None), third=Given(None), fourth=Given(None), /, *rest),
-        text_signature = "($self, *inputs)"
-    )]
-    fn step<'py>(
-        &mut self,
-        first: Given<'_, 'py>,
-        second: Given<'_, 'py>,
-        third: Given<'_, 'py>,
-        fourth: Given<'_, 'py>,
-        rest: &Bound<'py, PyTuple>,
-    ) -> PyResult<Bound<'py, PyAny>> {
-        self.give([first, second, third, fourth], rest)?;
-        self.status = self.instance.advance(1);
-        self.results(rest.py())
-    }
-
-    /// Steps under held inputs; returns the last outputs.
-    #[pyo3(
-        signature = (count, first=Given(None), second=Given(None), third=Given(None), fourth=Given(None), /, *rest),
-        text_signature = "($self, count, /, *inputs)"
-    )]
-    fn hold<'py>(
-        &mut self,
-        count: u64,
-        first: Given<'_, 'py>,
-        second: Given<'_, 'py>,
-        third: Given<'_, 'py>,
-        fourth: Given<'_, 'py>,
-        rest: &Bound<'py, PyTuple>,
-    ) -> PyResult<Bound<'py, PyAny>> {
-        self.give([first, second, third, fourth], rest)?;
-        let py = rest.py();
-        let instance = &mut self.instance;
-        self.status = in_parts(py, count, |_, some| (some, instance.advance(some)))?.1;
-        self.results(py)
     }
 
     /// A step for each row of inputs; returns the rows of outputs.
@@ -607,39 +560,54 @@ impl Stepper {
         Ok(())
     }
 
+    /// One step with these inputs; returns the outputs.
+    #[inline]
+    pub fn step<'py>(&mut self, py: Python<'py>, given: &[Given<'_, 'py>]) -> PyResult<Bound<'py, PyAny>> {
+        self.give(given)?;
+        self.status = self.instance.advance(1);
+        self.results(py)
+    }
+
+    /// Steps under held inputs, their number before the inputs; returns the last outputs.
+    #[inline]
+    pub fn hold<'py>(&mut self, py: Python<'py>, given: &[Given<'_, 'py>]) -> PyResult<Bound<'py, PyAny>> {
+        let Some((count, given)) = given.split_first() else {
+            return Err(PyTypeError::new_err("hold: the number of steps is needed, before the inputs"));
+        };
+        let count: u64 = count.extract()?;
+        self.give(given)?;
+        let instance = &mut self.instance;
+        self.status = in_parts(py, count, |_, some| (some, instance.advance(some)))?.1;
+        self.results(py)
+    }
+
     /// Writes the inputs.
-    fn give(&mut self, first: [Given; 4], rest: &Bound<PyTuple>) -> PyResult<()> {
+    #[inline]
+    fn give(&mut self, given: &[Given]) -> PyResult<()> {
         let needed = self.plan.inputs.len();
-        let few = first.iter().take_while(|given| given.0.is_some()).count();
-        // There are further ones only after these.
-        let given = if few < first.len() { few } else { few + rest.len() };
-        if given != needed {
-            let names: Vec<&str> = self.inputs();
-            return Err(PyTypeError::new_err(format!(
-                "{needed} inputs are needed, ({}), and {given} were given",
-                names.join(", ")
-            )));
+        if given.len() != needed {
+            let (names, given) = (self.inputs().join(", "), given.len());
+            return Err(PyTypeError::new_err(format!("{needed} inputs are needed, ({names}), and {given} were given")));
         }
         // All are read before one is written, so that a wrong one changes nothing.
-        let mut numbers = [0.0; 4];
-        for (k, given) in first.iter().enumerate().take(few) {
-            if let Some(given) = given.0 {
-                numbers[k] = self.number(k, given)?;
+        let (mut few, mut many) = ([0.0; 4], Vec::new());
+        let numbers = match needed <= few.len() {
+            true => &mut few[..needed],
+            false => {
+                many.resize(needed, 0.0);
+                &mut many[..]
             }
+        };
+        for (k, (number, given)) in numbers.iter_mut().zip(given).enumerate() {
+            *number = self.number(k, *given)?;
         }
-        if given > few {
-            let more = rest.iter_borrowed().enumerate().map(|(k, given)| self.number(few + k, given));
-            let more = more.collect::<PyResult<Vec<f64>>>()?;
-            let slots = self.plan.inputs[few..].iter().zip(more);
-            slots.for_each(|((_, slot), number)| self.instance.set(*slot, number));
-        }
-        self.plan.inputs.iter().zip(numbers).for_each(|((_, slot), number)| self.instance.set(*slot, number));
+        self.plan.inputs.iter().zip(numbers).for_each(|((_, slot), number)| self.instance.set(*slot, *number));
         Ok(())
     }
 
     /// An input as a number.
     #[inline]
-    fn number(&self, k: usize, given: Borrowed<PyAny>) -> PyResult<f64> {
+    fn number(&self, k: usize, given: Given) -> PyResult<f64> {
         given.extract().map_err(|_: PyErr| {
             let kind = given.get_type().name().map_or_else(|_| "?".into(), |name| name.to_string());
             PyTypeError::new_err(format!("`{}` is a number in SI, not {kind}", self.plan.inputs[k].0))
