@@ -3,6 +3,7 @@
 use crate::arrays;
 use crate::raise;
 use crate::stepper::{Plan, Started, names_of};
+use crate::transpose;
 use crate::watched::{self, guarded, in_place};
 use abi::description::{Guard, Kind};
 use abi::lanes::Lanes;
@@ -18,8 +19,9 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
-/// Rows of a tile: what is transposed at once, so that it stays in the nearest cache.
-const TILE: usize = 64;
+/// Rows of a tile: what is transposed at once. Longer ones leave the nearest cache, and of shorter ones the rows of an
+/// instance are read in pieces that are too short for the processor to read ahead.
+const TILE: usize = 128;
 
 /// Instances that are stepped together.
 #[derive(Clone)]
@@ -142,7 +144,10 @@ impl Job<'_> {
             if begin == 0 || self.per_row > 0 {
                 let of = |lane: usize| &given[lane.min(used - 1) * self.per_instance + begin * self.per_row..];
                 let tile = &mut into[..rows * n * width];
-                (0..width).for_each(|lane| self.give_lane(of(lane), tile, (lane, width)));
+                match (n, self.per_row) {
+                    (1, 1) => transpose::to_lanes(|lane| &of(lane)[..rows], tile, width),
+                    _ => (0..width).for_each(|lane| self.give_lane(of(lane), tile, (lane, width))),
+                }
             }
             let into = &into[..rows * n * width];
             let (from, to) = ((self.inputs, into), (self.columns, &mut out[..rows * wide * width]));
@@ -176,9 +181,17 @@ impl Job<'_> {
             for lane in (0..width).filter(|lane| again[*lane]) {
                 batch.load(lane, self.template.block());
             }
-            for (lane, end) in ends.iter().enumerate() {
-                let to = &mut taken[lane * self.size() + begin / self.every * m..];
-                self.take_lane(&out[..rows * wide * width], to, (lane, width), begin, *end);
+            let tile = &out[..rows * wide * width];
+            if self.every == 1 && wide == 1 {
+                transpose::from_lanes(tile, width, &mut taken[begin..], self.size(), used);
+                for (lane, end) in ends.iter().enumerate() {
+                    taken[lane * self.size() + begin..][..rows][*end..].fill(f64::NAN);
+                }
+            } else {
+                for (lane, end) in ends.iter().enumerate() {
+                    let to = &mut taken[lane * self.size() + begin / self.every * m..];
+                    self.take_lane(tile, to, (lane, width), begin, *end);
+                }
             }
         }
     }
@@ -188,7 +201,6 @@ impl Job<'_> {
         let n = self.inputs.len();
         match (n, self.per_row) {
             (0, _) => {}
-            (1, 1) => tile.chunks_exact_mut(width).zip(of).for_each(|(row, x)| row[lane] = *x),
             (_, 0) => {
                 for row in tile.chunks_exact_mut(n * width) {
                     row.chunks_exact_mut(width).zip(of).for_each(|(column, x)| column[lane] = *x);
@@ -206,14 +218,8 @@ impl Job<'_> {
     /// `begin`: the number of the first row of the tile.
     fn take_lane(&self, tile: &[f64], to: &mut [f64], (lane, width): (usize, usize), begin: usize, end: usize) {
         let (m, wide) = (self.outputs.len(), self.columns.len());
-        if self.every == 1 && wide == 1 {
-            let rows = tile.len() / width;
-            to.iter_mut().zip(tile.chunks_exact(width)).for_each(|(x, row)| *x = row[lane]);
-            to[end..rows].fill(f64::NAN);
-            return;
-        }
-        let rows = tile.chunks_exact(wide * width).enumerate();
-        let due = rows.filter(|(row, _)| (begin + row + 1).is_multiple_of(self.every));
+        let first = self.every - 1 - begin % self.every;
+        let due = tile.chunks_exact(wide * width).enumerate().skip(first).step_by(self.every);
         for ((row, of), to) in due.zip(to.chunks_exact_mut(m)) {
             for (x, column) in to.iter_mut().zip(of.chunks_exact(width)) {
                 *x = if row < end { column[lane] } else { f64::NAN };

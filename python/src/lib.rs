@@ -12,6 +12,7 @@ mod text;
 mod native;
 mod stepper;
 mod calls;
+mod transpose;
 mod batch;
 mod sweep;
 
