@@ -61,19 +61,94 @@ fn walk(
         found: Vec::new(),
         diagnostics,
         unknowns: Vec::new(),
-        types: Vec::with_capacity(system.nodes.len()),
+        types: vec![NodeType::Unknown; system.nodes.len()],
         vars: Vec::new(),
     };
     checker.declare();
-    for index in 0..system.nodes.len() {
-        let found = checker.node(ExprId(index as u32));
-        let found = checker.within_reason(ExprId(index as u32), found);
-        checker.types.push(found);
+    let early: Vec<bool> = system.var_ids().map(|id| checker.is_inferred_from_its_definition(id)).collect();
+    for typed in order(system, &early) {
+        match typed {
+            Typed::Node(id) => {
+                let found = checker.node(id);
+                checker.types[id.0 as usize] = checker.within_reason(id, found);
+            }
+            Typed::Definition(id) => checker.definition(id),
+        }
     }
-    checker.definitions();
     checker.statements();
     let found = std::mem::take(&mut checker.found);
     (checker.finish(), found)
+}
+
+/// What receives a type in turn.
+#[derive(Clone, Copy)]
+enum Typed {
+    Node(ExprId),
+    Definition(VarId),
+}
+
+/// All expressions and definitions in the order in which they are typed. Operands precede their expression, and the
+/// definition of an `early` quantity precedes its uses, so that a use that does not fit is reported, and not the
+/// definition. The others follow after all expressions, as do definitions that depend on each other.
+fn order(system: &System, early: &[bool]) -> Vec<Typed> {
+    let (nodes, vars) = (system.nodes.len(), system.vars.len());
+    let is_early = |id: &VarId| early[id.0 as usize];
+    let index = |typed: Typed| match typed {
+        Typed::Node(id) => id.0 as usize,
+        Typed::Definition(id) => nodes + id.0 as usize,
+    };
+    let (mut begun, mut done) = (vec![false; nodes + vars], vec![false; nodes + vars]);
+    let mut out = Vec::with_capacity(nodes + vars);
+    // These definitions first: a definition that is entered through its own expression would be typed before it.
+    let all = system.var_ids().filter(is_early).map(Typed::Definition);
+    let all = all.chain((0..nodes).map(|node| Typed::Node(ExprId(node as u32))));
+    let mut stack: Vec<(Typed, bool)> = Vec::new();
+    for first in all {
+        stack.push((first, false));
+        while let Some((typed, operands_done)) = stack.pop() {
+            let needs: Vec<Typed> = match typed {
+                Typed::Node(id) => match system.node(id) {
+                    Node::Var(var) | Node::Rate(var) | Node::PathRate(var) => {
+                        Some(*var).filter(is_early).map(Typed::Definition).into_iter().collect()
+                    }
+                    node => node.operands().map(Typed::Node).collect(),
+                },
+                Typed::Definition(id) => expressions(system.var(id)).into_iter().map(Typed::Node).collect(),
+            };
+            match (typed, operands_done) {
+                (_, false) if !std::mem::replace(&mut begun[index(typed)], true) => {
+                    stack.push((typed, true));
+                    stack.extend(needs.into_iter().rev().map(|need| (need, false)));
+                }
+                (_, false) => {}
+                (Typed::Definition(_), true) if needs.iter().any(|need| !done[index(*need)]) => {}
+                (_, true) => {
+                    done[index(typed)] = true;
+                    out.push(typed);
+                }
+            }
+        }
+    }
+    out.extend(system.var_ids().map(Typed::Definition).filter(|typed| !done[index(*typed)]));
+    out
+}
+
+/// The expressions that define a quantity, with the bounds of its range.
+fn expressions(var: &Var) -> Vec<ExprId> {
+    let bounds = [&var.range.low, &var.range.high].into_iter().flatten().map(|(bound, _)| *bound);
+    values(var).into_iter().chain(bounds).collect()
+}
+
+/// The same without the bounds.
+fn values(var: &Var) -> Vec<ExprId> {
+    match var.definition {
+        Definition::Missing | Definition::Free => Vec::new(),
+        Definition::Value(value, _) | Definition::Held { value, .. } => vec![value],
+        Definition::Continuous { initial, rate, path, .. } => {
+            [initial, rate].into_iter().chain(path.map(|(slope, _)| slope)).collect()
+        }
+        Definition::Sampled { initial, next, .. } => vec![initial, next],
+    }
 }
 
 /// E0105: an exponent too large to be represented.
@@ -115,6 +190,12 @@ enum NodeType {
     Real(Term),
     /// Has been reported; matches every type.
     Unknown,
+}
+
+impl NodeType {
+    fn is_inferred(&self) -> bool {
+        matches!(self, NodeType::Real(term) if !term.unknowns.is_empty())
+    }
 }
 
 struct Checker<'a> {
@@ -248,6 +329,13 @@ impl Checker<'_> {
             };
             self.vars.push(kind);
         }
+    }
+
+    /// Whether the definition of a quantity gives it its unit. A pure number may lack a unit that its uses tell: then it is
+    /// the number that is reported.
+    fn is_inferred_from_its_definition(&self, id: VarId) -> bool {
+        let values = values(self.system.var(id));
+        self.vars[id.0 as usize].is_inferred() && !values.into_iter().any(|value| self.is_bare(value))
     }
 
     // ---- nodes
@@ -759,31 +847,34 @@ impl Checker<'_> {
 
     // ---- definitions
 
-    fn definitions(&mut self) {
-        for id in self.system.var_ids() {
-            let var = self.system.var(id);
-            let kind = self.vars[id.0 as usize].clone();
-            match &var.definition {
-                Definition::Missing | Definition::Free => {}
-                Definition::Value(value, origin) | Definition::Held { value, origin, .. } => {
-                    self.defines(id, &kind, *value, *origin);
-                }
-                Definition::Continuous { initial, rate, .. } => {
-                    let rate = (*rate != *initial).then_some(*rate);
-                    self.state(id, &kind, *initial, rate);
-                }
-                Definition::Sampled { initial, next, .. } => {
-                    self.defines(id, &kind, *initial, self.system.start_origin(id));
-                    self.defines(id, &kind, *next, Origin::Equation(self.system.span(*next)));
-                }
+    fn definition(&mut self, id: VarId) {
+        let var = self.system.var(id);
+        let kind = self.vars[id.0 as usize].clone();
+        let reported = self.diagnostics.len();
+        match &var.definition {
+            Definition::Missing | Definition::Free => {}
+            Definition::Value(value, origin) | Definition::Held { value, origin, .. } => {
+                self.defines(id, &kind, *value, *origin);
             }
-            for bound in [var.range.low, var.range.high].into_iter().flatten().map(|(bound, _)| bound) {
-                if let (NodeType::Real(wanted), NodeType::Real(found)) = (&kind, self.kind(bound).clone())
-                    && !self.unify(&found, wanted)
-                {
-                    self.mismatch(bound, &found, &wanted.clone());
-                }
+            Definition::Continuous { initial, rate, .. } => {
+                let rate = (*rate != *initial).then_some(*rate);
+                self.state(id, &kind, *initial, rate);
             }
+            Definition::Sampled { initial, next, .. } => {
+                self.defines(id, &kind, *initial, self.system.start_origin(id));
+                self.defines(id, &kind, *next, Origin::Equation(self.system.span(*next)));
+            }
+        }
+        for bound in [var.range.low, var.range.high].into_iter().flatten().map(|(bound, _)| bound) {
+            if let (NodeType::Real(wanted), NodeType::Real(found)) = (&kind, self.kind(bound).clone())
+                && !self.unify(&found, wanted)
+            {
+                self.mismatch(bound, &found, &wanted.clone());
+            }
+        }
+        // Its uses would be reported for the same mistake.
+        if self.diagnostics.len() > reported && kind.is_inferred() {
+            self.vars[id.0 as usize] = NodeType::Unknown;
         }
     }
 
@@ -1157,5 +1248,103 @@ fn angular_unit(dimension: Dimension) -> String {
         "rad/s^2".into()
     } else {
         Unit::si(dimension).to_string()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use crate::NoSources;
+    use crate::ir::random::Random;
+
+    /// Lines of a model without inferred units that fit: parameters with units, and quantities without, each made of
+    /// earlier ones. Also the names of the latter, and those of outputs.
+    fn lines(random: &mut Random) -> (Vec<String>, Vec<String>, Vec<String>) {
+        const PARAMS: [&str; 4] = ["2 N", "3 m/s", "0.5 kg", "4"];
+        let mut lines: Vec<String> =
+            PARAMS.iter().enumerate().map(|(k, value)| format!("param p{k} = {value}")).collect();
+        let (mut known, mut outputs): (Vec<String>, Vec<String>) = (vec!["p0".into()], Vec::new());
+        for k in 0..1 + random.below(8) {
+            let a = known[random.below(known.len())].clone();
+            let p = format!("p{}", random.below(PARAMS.len()));
+            let name = format!("q{k}");
+            let value = match random.below(7) {
+                0 => format!("{a} * {p}"),
+                1 => format!("{p} / {a}"),
+                2 => format!("{a} + 2 * {a}"),
+                3 => format!("if {a} > {a} / 2 then {a} else 3 * {a}"),
+                4 => format!("sqrt(abs({a}) * {a})"),
+                5 => format!("max({a}, -{a})"),
+                _ => a.clone(),
+            };
+            match random.below(4) {
+                0 => {
+                    lines.push(format!("output {name} = {value}"));
+                    outputs.push(name.clone());
+                }
+                1 => lines.push(format!("state {name} = {value}\n  d{name}/dt = ({value} - {name}) / 1 s")),
+                _ => lines.push(format!("let {name} = {value}")),
+            }
+            known.push(name);
+        }
+        known.remove(0);
+        (lines, known, outputs)
+    }
+
+    /// The codes of errors about units, each with the line in which its first label begins.
+    fn blamed(text: &str) -> Vec<String> {
+        let mut loaded = crate::load("a.fric", text, &NoSources);
+        let found = crate::check(&mut loaded, &NoSources);
+        let errors = found.iter().filter(|found| found.code.starts_with("E010"));
+        let line = |at: usize| text[text[..at].rfind('\n').map_or(0, |at| at + 1)..].lines().next().unwrap_or_default();
+        errors.map(|found| format!("{} {}", found.code, line(found.labels[0].span.start as usize))).collect()
+    }
+
+    /// Wherever it stands, a use of a quantity without a unit that does not fit its definition is reported, and not the
+    /// definition.
+    #[test]
+    fn a_use_with_a_wrong_unit_is_blamed_at_the_use() {
+        let mut kinds = [0; 6];
+        for seed in 1..=600 {
+            let mut random = Random(seed);
+            let (inner, names, outputs) = lines(&mut random);
+            let kind = random.below(kinds.len());
+            let name = if kind < 5 { &names } else { &outputs };
+            if name.is_empty() {
+                continue;
+            }
+            let name = &name[random.below(name.len())];
+            let (mut expect, mut own) = (String::new(), None);
+            match kind {
+                0 => own = Some(format!("let wrong = {name} + 1 kg^5·m^7")),
+                1 => own = Some(format!("output wrong [kg^5·m^7] = {name}")),
+                2 => own = Some(format!("require max({name}, 1 kg^5·m^7) > 0 * {name}  // wrong")),
+                3 => own = Some(format!("part wrong = Taker(v = {name})")),
+                4 => own = Some(format!("let wrong = if {name} > 1 kg^5·m^7 then 1 else 2")),
+                _ => expect = format!("  expect max({name}) > 1 kg^5·m^7  // wrong\n"),
+            }
+            let text = |own: Option<&String>, expect: &str, random: &mut Random| {
+                let mut lines: Vec<&String> = inner.iter().collect();
+                lines.extend(own);
+                for last in (1..lines.len()).rev() {
+                    lines.swap(last, random.below(last + 1));
+                }
+                let lines: String = lines.iter().map(|line| format!("  {line}\n")).collect();
+                format!(
+                    "model Taker {{\n  input v [kg^5·m^7]\n  output w [1] = v / 1 kg^5·m^7\n}}\nmodel Inner {{\n{lines}}}\n\
+                     experiment it {{\n  run Inner() for 1 s\n{expect}}}\n"
+                )
+            };
+            let order = random.clone();
+            let right = text(None, "", &mut order.clone());
+            assert_eq!(blamed(&right), [""; 0], "seed {seed}\n{right}");
+            let wrong = text(own.as_ref(), &expect, &mut order.clone());
+            let found = blamed(&wrong);
+            assert!(
+                !found.is_empty() && found.iter().all(|found| found.contains("wrong")),
+                "seed {seed}: {found:?}\n{wrong}"
+            );
+            kinds[kind] += 1;
+        }
+        assert!(kinds.iter().all(|count| *count > 30), "{kinds:?}");
     }
 }
