@@ -1259,7 +1259,7 @@ mod tests {
     /// Lines of a model without inferred units that fit: parameters with units, and quantities without, each made of
     /// earlier ones. Also the names of the latter, and those of outputs.
     fn lines(random: &mut Random) -> (Vec<String>, Vec<String>, Vec<String>) {
-        const PARAMS: [&str; 4] = ["2 N", "3 m/s", "0.5 kg", "4"];
+        const PARAMS: [&str; 4] = ["2 N", "3 m/s", "0.5 kg", "4 s"];
         let mut lines: Vec<String> =
             PARAMS.iter().enumerate().map(|(k, value)| format!("param p{k} = {value}")).collect();
         let (mut known, mut outputs): (Vec<String>, Vec<String>) = (vec!["p0".into()], Vec::new());
