@@ -64,7 +64,7 @@ pub fn check(fixed: &Fixed, files: &Files) -> Vec<Diagnostic> {
     let also: Vec<u64> =
         ends.iter().map(|slot| u64::from(slot.0)).chain([fixed.step.to_bits(), fixed.method as u64]).collect();
     match KNOWN.answer(fixed.program, &also, || Finding::of(fixed.program, &ends, fixed.method, fixed.step)) {
-        Finding::Unstable(unstable, implicit) => vec![fixed.unstable(&unstable, implicit, files)],
+        Finding::Unstable(unstable) => vec![fixed.unstable(&unstable, files)],
         Finding::Singular(singular) => vec![fixed.singular(&singular)],
         Finding::Chatters(chatter) => vec![fixed.chatters(&chatter)],
         Finding::Nothing => Vec::new(),
@@ -73,8 +73,7 @@ pub fn check(fixed: &Fixed, files: &Files) -> Vec<Diagnostic> {
 
 #[derive(Clone)]
 enum Finding {
-    /// An instability, and whether `implicit` is stable with this step.
-    Unstable(Unstable, bool),
+    Unstable(Unstable),
     Singular(Singular),
     Chatters(Chatter),
     Nothing,
@@ -94,10 +93,7 @@ impl Finding {
         let look = open && method == Method::Implicit;
         match (look.then(|| bench.singular(step)).flatten(), unstable) {
             (Some(singular), _) => Finding::Singular(singular),
-            (None, Some(unstable)) => {
-                let implicit = method != Method::Implicit && bench.unstable(Method::Implicit, step).is_none();
-                Finding::Unstable(unstable, implicit)
-            }
+            (None, Some(unstable)) => Finding::Unstable(unstable),
             (None, None) => Finding::Nothing,
         }
     }
@@ -110,7 +106,7 @@ impl Fixed<'_> {
         self.system.var_ids().filter(continuous).nth(number).expect("the program has a slot for each state")
     }
 
-    fn unstable(&self, unstable: &Unstable, implicit: bool, files: &Files) -> Diagnostic {
+    fn unstable(&self, unstable: &Unstable, files: &Files) -> Diagnostic {
         let (system, id) = (self.system, self.state(unstable.state));
         let var = system.var(id);
         let (method, step) = (self.method.name(), duration(self.step, 3));
@@ -181,17 +177,31 @@ impl Fixed<'_> {
         let file = &files.get(self.place.file).name;
         let shorter = self.shorter(largest);
         let solver = if self.by == StepBy::Option { "--solver" } else { "solver" };
-        let help = match (linear && stiff, implicit) {
-            (true, _) => format!(
+        let help = match linear && stiff {
+            true => format!(
                 "{derivative} is linear in {}, so `{solver} expo` steps it exactly at any speed.\n\
                  `fric explain {file} {}` shows the numbers per state",
                 var.name, self.name
             ),
-            (false, true) => format!("`{solver} implicit` is stable at this step; or {shorter}"),
-            (false, false) => format!("{shorter}{}", self.adaptive()),
+            false if self.is_stable_by_implicit() => {
+                format!("`{solver} implicit` is stable at this step; or {shorter}")
+            }
+            false => format!("{shorter}{}", self.adaptive()),
         };
         let keep = if open { "\nTo keep it: `allow large-step \"...\"`" } else { "" };
         out.help(format!("{help}{keep}"))
+    }
+
+    /// Whether `implicit`, which is another method, is stable with this step.
+    fn is_stable_by_implicit(&self) -> bool {
+        static KNOWN: Memo<bool> = Memo::new();
+        let ends = self.ends_at();
+        let also: Vec<u64> = ends.iter().map(|slot| u64::from(slot.0)).chain([self.step.to_bits()]).collect();
+        let is_stable = || {
+            let bench = Bench::new(self.program, &ends);
+            bench.is_some_and(|bench| bench.unstable(Method::Implicit, self.step).is_none())
+        };
+        self.method != Method::Implicit && KNOWN.answer(self.program, &also, is_stable)
     }
 
     /// What to write for steps of at most this length.
