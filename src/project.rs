@@ -18,6 +18,8 @@ pub fn library() -> &'static [(&'static str, &'static str)] {
 
 /// Longest accepted text; a longer file was not written by hand.
 const MOST_BYTES: u64 = 64 << 20;
+/// Largest accepted recording: 10⁷ rows of ten columns.
+const MOST_OF_RECORDING: u64 = 1 << 30;
 
 /// The name of the standard input, and of the standard output, in the place of a file.
 const STANDARD: &str = "-";
@@ -37,10 +39,10 @@ pub fn read(path: &Path) -> Result<String, String> {
         static INPUT: OnceLock<Result<String, String>> = OnceLock::new();
         return INPUT.get_or_init(read_input).clone();
     }
-    text(read_bytes(path)?)
+    text(read_bytes(path, MOST_BYTES)?)
 }
 
-fn read_bytes(path: &Path) -> Result<Vec<u8>, String> {
+fn read_bytes(path: &Path, most: u64) -> Result<Vec<u8>, String> {
     let about = |error: io::Error| match error.kind() {
         io::ErrorKind::NotFound => "there is no such file".to_string(),
         io::ErrorKind::PermissionDenied => "it may not be read (permission denied)".into(),
@@ -51,8 +53,8 @@ fn read_bytes(path: &Path) -> Result<Vec<u8>, String> {
     if metadata.is_dir() {
         return Err("it is a folder, not a file".into());
     }
-    if metadata.len() > MOST_BYTES {
-        return Err(format!("it is larger than {} MB", MOST_BYTES >> 20));
+    if metadata.len() > most {
+        return Err(format!("it is larger than {} MB", most >> 20));
     }
     fs::read(path).map_err(about)
 }
@@ -124,7 +126,8 @@ impl crate::compile::Sources for Disk {
 /// Why it cannot be read, in words.
 pub fn bytes_named(from: &str, path: &str) -> Result<(PathBuf, Vec<u8>), String> {
     let path = path_named(from, path)?;
-    let bytes = read_bytes(&path)?;
+    let is_text = path.extension().is_some_and(|ending| ending == "fric");
+    let bytes = read_bytes(&path, if is_text { MOST_BYTES } else { MOST_OF_RECORDING })?;
     Ok((path, bytes))
 }
 
@@ -225,7 +228,7 @@ pub fn make_folder_of(path: &Path) -> io::Result<()> {
 /// # Errors
 /// Why not; an existing file of that name is then unchanged.
 pub fn write(path: &Path, bytes: &[u8]) -> io::Result<()> {
-    write_with(path, bytes, true)
+    write_with(path, &mut |out| out.write_all(bytes), true)
 }
 
 /// As [`write()`], but does not wait for the disk, which takes longer than many a run: for results, which the same command
@@ -234,17 +237,20 @@ pub fn write(path: &Path, bytes: &[u8]) -> io::Result<()> {
 /// # Errors
 /// As `write`.
 pub fn write_result(path: &Path, bytes: &[u8]) -> io::Result<()> {
-    write_with(path, bytes, false)
+    write_with(path, &mut |out| out.write_all(bytes), false)
 }
 
-fn write_with(path: &Path, bytes: &[u8], synced: bool) -> io::Result<()> {
+/// Writes what a file holds.
+type Content<'c> = dyn FnMut(&mut dyn Write) -> io::Result<()> + 'c;
+
+fn write_with(path: &Path, content: &mut Content, synced: bool) -> io::Result<()> {
     make_folder_of(path)?;
     match fs::metadata(path) {
         // A pipe or a device is written directly; it must not be replaced by a file.
-        Ok(old) if !old.is_file() => fs::OpenOptions::new().write(true).open(path)?.write_all(bytes),
+        Ok(old) if !old.is_file() => content(&mut fs::OpenOptions::new().write(true).open(path)?),
         // The new file has the permissions of the old one, and is never readable by anybody else, even briefly.
-        Ok(old) => replace(path, bytes, 0o600, Some(old.permissions()), synced),
-        Err(_) => replace(path, bytes, 0o666, None, synced),
+        Ok(old) => replace(path, content, 0o600, Some(old.permissions()), synced),
+        Err(_) => replace(path, content, 0o666, None, synced),
     }
 }
 
@@ -262,11 +268,17 @@ pub fn write_secret(path: &Path, bytes: &[u8]) -> io::Result<()> {
     if fs::symlink_metadata(path).is_ok() {
         return Err(io::ErrorKind::AlreadyExists.into());
     }
-    replace(path, bytes, 0o600, None, true)
+    replace(path, &mut |out| out.write_all(bytes), 0o600, None, true)
 }
 
 /// Writes a temporary file with this mode, then sets its permissions and renames it. `synced`: waits for the disk before.
-fn replace(path: &Path, bytes: &[u8], mode: u32, permissions: Option<fs::Permissions>, synced: bool) -> io::Result<()> {
+fn replace(
+    path: &Path,
+    content: &mut Content,
+    mode: u32,
+    permissions: Option<fs::Permissions>,
+    synced: bool,
+) -> io::Result<()> {
     let name = path.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
     let neighbour = path.with_file_name(format!(".{name}.{}", std::process::id()));
     // A file of that name was left by a killed process, or is a symbolic link set as a trap: never write through it.
@@ -280,7 +292,7 @@ fn replace(path: &Path, bytes: &[u8], mode: u32, permissions: Option<fs::Permiss
     let _ = mode;
     let written = options
         .open(&neighbour)
-        .and_then(|mut file| file.write_all(bytes).and_then(|()| if synced { file.sync_all() } else { Ok(()) }))
+        .and_then(|mut file| content(&mut file).and_then(|()| if synced { file.sync_all() } else { Ok(()) }))
         .and_then(|()| permissions.map_or(Ok(()), |permissions| fs::set_permissions(&neighbour, permissions)))
         .and_then(|()| fs::rename(&neighbour, path));
     if written.is_err() {

@@ -103,7 +103,7 @@ pub fn varying(
     let one = |variant: experiment::Variant| {
         let paths = varied(&variant);
         let slice = sliced(&variant.program, &variant.experiment);
-        runs(variant, slice, &paths, &loaded.files, options.interpret)
+        runs(variant, slice, &paths, None, &loaded.files, options.interpret)
     };
     Ok(variants.into_iter().map(one).collect())
 }
@@ -136,7 +136,8 @@ fn fitted(loaded: &Loaded, read: fit::Read, options: &Options) -> Result<fit::Fi
             paths.extend(pole.map(str::to_string));
             let paths = experiment::start_values::params(&variant.system, &paths);
             // It reads other quantities than measures and plots.
-            runs(variant, None, &paths, &loaded.files, options.interpret)
+            let read = fit::compared_slots(&variant.experiment, &asks);
+            runs(variant, None, &paths, Some(&read), &loaded.files, options.interpret)
         };
         let held = held.and_then(|variant| {
             let held = many(variant, paths.clone(), Some(experiment::held::POLE));
@@ -174,17 +175,19 @@ pub fn adjustable(
         let params = description.quantities.iter().filter(|q| description.layout.params.contains(q.slot));
         let mut paths: Vec<String> = params.map(|quantity| quantity.path.clone()).collect();
         paths.retain(|path| experiment::vary::built_in(&variant, std::slice::from_ref(path)).is_none());
-        runs(variant, None, &paths, &loaded.files, options.interpret)
+        runs(variant, None, &paths, None, &loaded.files, options.interpret)
     };
     Ok(variants.into_iter().map(one).collect())
 }
 
 /// An experiment with its code, for runs that differ in the parameters `paths`. `slice`: the program whose step leaves
-/// out what nothing in these runs reads, if there is such.
+/// out what nothing in these runs reads, if there is such. `read`: what is read after each step of runs in lanes, if not
+/// what the measures need.
 fn runs(
     variant: experiment::Variant,
     slice: Option<ir::program::Program>,
     paths: &[String],
+    read: Option<&[Slot]>,
     files: &frontend::source::Files,
     interpret: bool,
 ) -> experiment::vary::Varying {
@@ -207,7 +210,8 @@ fn runs(
     });
     let runnable = experiment::vary::Runnable { code, slice, adaptive, notes };
     let varying = experiment::vary::Varying::new(variant, paths, files, runnable);
-    let lanes = |varying: &experiment::vary::Varying| match varying.read_each_step() {
+    let read = read.filter(|_| method != Method::Adaptive).map(<[Slot]>::to_vec);
+    let lanes = |varying: &experiment::vary::Varying| match read.or(varying.read_each_step()) {
         Some(read) => codegen::tiering::lanes_on_rows(&many, method, &[], &read),
         None => codegen::tiering::lanes(&many, method),
     };

@@ -18,6 +18,7 @@ use abi::{Function, Slot};
 use grammar::ast::{self, Expr, ExprKind};
 use grammar::diagnostic::Diagnostic;
 use grammar::span::{FileId, Span};
+use std::sync::Arc;
 
 /// Columns of a recording: name, numbers over time in SI, and the unit for display.
 type Columns = Vec<(String, Table, Unit)>;
@@ -73,13 +74,19 @@ pub fn derive(
             diagnostics.push(error.help("write an expression that is finite for every row, or leave such rows out"));
             return None;
         }
-        let x = data.first().map_or(Vec::new(), |(_, table, _)| table.x.clone());
+        let x = times(data);
         data.push(column(&one.name.text, x, y, unit));
     }
     Some(())
 }
 
-fn column(name: &str, x: Vec<f64>, y: Vec<f64>, unit: Unit) -> (String, Table, Unit) {
+/// The times of the rows, which all columns share.
+fn times(data: &Columns) -> Arc<[f64]> {
+    data.first().map_or(Arc::from([]), |(_, table, _)| table.x.clone())
+}
+
+fn column(name: &str, x: Arc<[f64]>, y: Vec<f64>, unit: Unit) -> (String, Table, Unit) {
+    let y = y.into();
     let x_unit = Unit::si(Dimension::of([0, 0, 1, 0, 0]));
     let table = Table { name: format!("data.{name}"), x_unit, y_unit: unit.clone(), smooth: false, held: false, x, y };
     (name.to_string(), table, unit)
@@ -111,7 +118,7 @@ impl Deriving<'_> {
             && let [_, name] = &path.segments[..]
             && let Some((_, table, unit)) = self.data.iter().find(|(known, ..)| *known == name.name.text)
         {
-            return Some((table.y.clone(), unit.clone()));
+            return Some((table.y.to_vec(), unit.clone()));
         }
         self.computed(&expr)
     }
@@ -122,7 +129,7 @@ impl Deriving<'_> {
             ExprKind::Call { function, args, window: None } if self.is_filter(function) => {
                 let (y, unit) = self.filtered(function, args, expr.span)?;
                 let name = format!("#{}", self.data.len());
-                let x = self.data.first().map_or(Vec::new(), |(_, table, _)| table.x.clone());
+                let x = times(&self.data);
                 self.data.push(column(&name, x, y, unit));
                 let segment = |text: &str| {
                     let name = ast::Name { text: text.to_string(), span: expr.span };
@@ -166,7 +173,7 @@ impl Deriving<'_> {
             return self.report(error.help("write `smooth(data.x, 60 Hz)` and `slope(data.x)`"));
         }
         let (x, unit) = self.value(&args[0])?;
-        let times = self.data.first().map_or(Vec::new(), |(_, table, _)| table.x.clone());
+        let times = times(&self.data);
         let interval = match equidistant(&times, self.steady, span) {
             Ok(interval) => interval,
             Err(error) => return self.report(error),
@@ -221,7 +228,8 @@ impl Deriving<'_> {
     /// An expression without filters, row by row.
     fn computed(&mut self, expr: &Expr) -> Option<(Vec<f64>, Unit)> {
         // One point stands for each column: flattening needs its unit only.
-        let first = |(name, table, _): &(String, Table, Unit)| column(name, vec![0.0], vec![0.0], table.y_unit.clone());
+        let first =
+            |(name, table, _): &(String, Table, Unit)| column(name, Arc::from([0.0]), vec![0.0], table.y_unit.clone());
         let request = Request {
             instance: Instance::Alone(&self.empty, self.root),
             overrides: Vec::new(),

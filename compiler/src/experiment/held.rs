@@ -11,13 +11,13 @@ use grammar::ast::BinaryOp;
 /// The path of the pole of the observer, in 1/s. No declared parameter can have such a name.
 pub const POLE: &str = "pole(fit)";
 
-/// For each compared state x, with the recorded value d and the pole p:
-///
-///   dx/dt += 2 p (d − x)
-///   dv/dt += p² (d − x)      where dx/dt = v is a state
-///
-/// Both poles of the error are then at −p, where v is otherwise free. Returns whether a state is compared.
-pub fn hold(system: &mut System, compared: &[ExprId]) -> bool {
+/// Whether a state is compared, so that a run can be held.
+pub fn is_possible(system: &System, compared: &[ExprId]) -> bool {
+    !states(system, compared).is_empty()
+}
+
+/// The compared states, each with what the recording has of it.
+fn states(system: &System, compared: &[ExprId]) -> Vec<(VarId, ExprId)> {
     let mut all: Vec<(VarId, ExprId)> = Vec::new();
     for difference in compared {
         let Node::Binary(BinaryOp::Subtract, a, b) = *system.node(*difference) else { continue };
@@ -29,6 +29,17 @@ pub fn hold(system: &mut System, compared: &[ExprId]) -> bool {
             }
         }
     }
+    all
+}
+
+/// For each compared state x, with the recorded value d and the pole p:
+///
+///   dx/dt += 2 p (d − x)
+///   dv/dt += p² (d − x)      where dx/dt = v is a state
+///
+/// Both poles of the error are then at −p, where v is otherwise free. Returns whether a state is compared.
+pub fn hold(system: &mut System, compared: &[ExprId]) -> bool {
+    let all = states(system, compared);
     let Some((first, _)) = all.first() else { return false };
     let place = system.span(compared[0]);
     let number = |value, dimension| Node::Number { value, dimension, angle: Angle::Silent };

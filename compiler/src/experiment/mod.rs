@@ -47,6 +47,7 @@ use grammar::ast::{self, BinaryOp, ExperimentStatement, Expr};
 use grammar::diagnostic::Diagnostic;
 use grammar::span::{FileId, Span};
 use std::borrow::Cow;
+use std::sync::Arc;
 
 /// Changes to an experiment from outside.
 #[derive(Clone, Debug, Default)]
@@ -123,12 +124,12 @@ pub struct Variant {
     /// For software in the loop: the rig.
     pub rig: Option<SimulatedRig>,
     /// Of a fit: the times of the rows of its recording in s, from 0.
-    pub rows: Vec<f64>,
+    pub rows: Arc<[f64]>,
     /// Of a fit: the time of the first row in the file, in s.
     pub begins: f64,
     /// Of a fit: its recording has no times; each row is a steady point.
     pub steady: bool,
-    /// Of a fit: the run is held to its recording.
+    /// Of a fit: the run can be held to its recording, and is where the changes say so.
     pub held: bool,
     /// Parameters that its panel may turn, in this order; all if there are none.
     pub tuned: Vec<Tuned>,
@@ -263,10 +264,10 @@ pub fn read(
     if derive(texts, &parts.derived, &mut data, steady, &mut diagnostics).is_none() {
         return Err(diagnostics);
     }
-    let (mut rows, mut begins) = (Vec::new(), 0.0);
+    let (mut rows, mut begins): (Arc<[f64]>, f64) = (Arc::from([]), 0.0);
     if let (Some(fit), Some((_, first, _))) = (fit, data.first()) {
         if steady {
-            rows = of_fit::hold(&mut data);
+            rows = of_fit::hold(&mut data).into();
         } else {
             begins = first.x.first().copied().unwrap_or(0.0);
             rows = match of_fit::interval(&first.x) {
@@ -274,7 +275,7 @@ pub fn read(
                 Some(interval) => (0..first.x.len()).map(|k| k as f64 * interval).collect(),
                 None => first.x.iter().map(|t| t - begins).collect(),
             };
-            data.iter_mut().for_each(|(_, table, _)| table.x.clone_from(&rows));
+            data.iter_mut().for_each(|(_, table, _)| table.x = rows.clone());
         }
         if parts.solver.is_none() && given.method.is_none() {
             let (method, step, tol) = of_fit::default_solver(fit, &rows, steady);
@@ -508,10 +509,13 @@ fn variant<'a>(
             let flat = flatten(loaded, sources, &request);
             let mut system = flat.system;
             diagnostics.extend(flat.diagnostics);
-            if given.held && !flat.observed.is_empty() {
+            if !flat.observed.is_empty() {
                 let compared = plots.last().map_or(&[][..], |(curves, _)| curves);
                 let compared: Vec<ExprId> = compared.iter().map(|curve| flat.observed[curve.value]).collect();
-                held = held::hold(&mut system, &compared);
+                held = match given.held {
+                    true => held::hold(&mut system, &compared),
+                    false => held::is_possible(&system, &compared),
+                };
             }
             start_values::open(&mut system, &given.vary);
             let ports = given.ports.as_ref().map(|ports| open(&mut system, ports, &mut diagnostics));
@@ -708,7 +712,7 @@ fn variant<'a>(
     });
     let outputs = ports.outputs.iter().zip(ports_at).map(|((path, _), at)| (path.clone(), slots[at]));
     let ports = (inputs.collect(), outputs.collect());
-    let (rows, begins, steady) = (Vec::new(), 0.0, false);
+    let (rows, begins, steady) = (Arc::from([]), 0.0, false);
     Ok(Variant {
         label,
         system,

@@ -10,6 +10,7 @@ use abi::plan::Method;
 use abi::unit::Unit;
 use grammar::ast::{self, BinaryOp, ExperimentStatement, Expr, ExprKind, FitStatement};
 use grammar::diagnostic::Diagnostic;
+use std::sync::Arc;
 
 /// What an item of `minimise` compares.
 #[derive(Clone, Copy)]
@@ -264,18 +265,19 @@ pub fn hold(data: &mut [(String, Table, Unit)]) -> Vec<f64> {
     order.sort_by(|a, b| first.y[*a].total_cmp(&first.y[*b]));
     let begins = |k: usize| k as f64 * (HELD + PASSAGE);
     let n = order.len();
+    let x: Arc<[f64]> = (0..n).flat_map(|k| [begins(k), begins(k) + HELD]).collect();
     for (_, table, _) in data {
-        table.x = (0..n).flat_map(|k| [begins(k), begins(k) + HELD]).collect();
+        table.x = x.clone();
         table.y = order.iter().flat_map(|k| [table.y[*k]; 2]).collect();
     }
     (0..n).map(|k| begins(k) + HELD).collect()
 }
 
 /// The times at which the recorded inputs of a run have corners.
-pub fn corners(rows: &[f64], steady: bool) -> Vec<f64> {
+pub fn corners(rows: &Arc<[f64]>, steady: bool) -> Arc<[f64]> {
     match steady {
         true => rows.iter().flat_map(|t| [*t, t + PASSAGE]).collect(),
-        false => rows.to_vec(),
+        false => rows.clone(),
     }
 }
 

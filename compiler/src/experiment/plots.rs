@@ -192,7 +192,7 @@ impl Reader<'_> {
         match self.system.node(id) {
             Node::Var(_) | Node::Rate(_) | Node::InRegime(..) => None,
             Node::Table(table, at) if matches!(self.system.node(*at), Node::Time) => {
-                Some(self.system.tables[*table as usize].name.starts_with("data."))
+                Some(self.system.tables[*table as usize].is_recorded())
             }
             node => node.operands().try_fold(false, |any, operand| Some(any | self.is_recorded(operand)?)),
         }

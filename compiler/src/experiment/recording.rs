@@ -9,6 +9,7 @@ use abi::unit::{Dimension, Unit};
 use grammar::ast;
 use grammar::diagnostic::Diagnostic;
 use grammar::span::FileId;
+use std::sync::Arc;
 
 /// Columns of a recording as tables over time. Those of steady points have no times yet.
 pub(super) fn recording(
@@ -58,7 +59,7 @@ pub(super) fn recording(
     let seconds = Dimension::of([0, 0, 1, 0, 0]);
     let t = match time {
         Some(time) => times(data, (time, &values[time].0, &values[time].1), diagnostics)?,
-        None => Vec::new(),
+        None => Arc::from([]),
     };
     let named = data.columns.iter().zip(values.drain(..)).filter(|(column, _)| column.name.text != "_");
     let table = |(column, (y, unit)): (&ast::Column, (Vec<f64>, Unit))| {
@@ -70,7 +71,7 @@ pub(super) fn recording(
             smooth: false,
             held: column.hold,
             x: t.clone(),
-            y,
+            y: y.into(),
         };
         (name, table, unit)
     };
@@ -82,7 +83,7 @@ fn times(
     data: &ast::Data,
     (at, t, unit): (usize, &[f64], &Unit),
     diagnostics: &mut Vec<Diagnostic>,
-) -> Option<Vec<f64>> {
+) -> Option<Arc<[f64]>> {
     if unit.dimension != Dimension::of([0, 0, 1, 0, 0]) {
         let column = &data.columns[at];
         let is = if unit.dimension.is_none() { "no unit".to_string() } else { format!("{unit}") };
@@ -97,5 +98,5 @@ fn times(
         diagnostics.push(error.help("is `t` the column that was meant? Sort the rows, and keep one for each time"));
         return None;
     }
-    Some(t.to_vec())
+    Some(t.into())
 }

@@ -23,6 +23,7 @@ use abi::unit::{Dimension, Unit};
 use grammar::ast::{self, ExperimentStatement, Expr, FitStatement};
 use grammar::diagnostic::Diagnostic;
 use grammar::span::Span;
+use std::sync::Arc;
 
 /// A fit, compiled; of several alternatives, one of them.
 pub struct Fit {
@@ -64,13 +65,13 @@ pub struct Asks {
     /// The compared quantities.
     pub items: Vec<Item>,
     /// Times of the rows of the recording in s, from 0.
-    pub rows: Vec<f64>,
+    pub rows: Arc<[f64]>,
     /// The columns of the recording beside time: name, unit, and a value in SI for each row.
-    pub columns: Vec<(String, Unit, Vec<f64>)>,
+    pub columns: Vec<(String, Unit, Arc<[f64]>)>,
     /// The rows are steady points, without time: each is held for [`of_fit::HELD`], and compared at the end.
     pub steady: bool,
     /// Times at which the recorded inputs have corners, in s.
-    pub corners: Vec<f64>,
+    pub corners: Arc<[f64]>,
     /// Time of the first row in the file, in s.
     pub begins: f64,
     /// Rows from this time to that time are compared.
@@ -156,6 +157,18 @@ pub struct Read {
     pub name: Span,
     /// Lints that it allows.
     pub allowed: Vec<String>,
+}
+
+/// The slots of the compared quantities in the plan of a run, each once, in their order: what is read after each step.
+pub fn compared_slots(plan: &abi::plan::Experiment, asks: &Asks) -> Vec<Slot> {
+    let mut slots = Vec::new();
+    let mut series = plan.plots.last().map_or(&[][..], |plot| &plot.series).iter();
+    for item in &asks.items {
+        slots.extend(series.next().map(|series| series.slot).filter(|slot| !slots.contains(slot)));
+        // Both sides follow a difference.
+        series.by_ref().take(if item.sides.is_some() { 2 } else { 0 }).for_each(drop);
+    }
+    slots
 }
 
 /// The fit of this name in the root file.
@@ -482,10 +495,12 @@ fn run(
         }
         first => {
             changes.set.extend(set);
-            match (experiment::read(loaded, sources, name, &changes, warnings, &mut |_| ()), first) {
-                (Ok(variants), _) => variants,
+            // A long recording is in memory once.
+            let as_written = first.err();
+            match experiment::read(loaded, sources, name, &changes, warnings, &mut |_| ()) {
+                Ok(variants) => variants,
                 // The errors of the text as it is written, rather than of the values above.
-                (Err(_), Err(errors)) | (Err(errors), Ok(_)) => return Err(errors),
+                Err(errors) => return Err(as_written.unwrap_or(errors)),
             }
         }
     };
@@ -501,7 +516,7 @@ fn run(
         }
     };
     window(&mut variant.experiment);
-    let held = match asks.regimes || asks.steady {
+    let held = match asks.regimes || asks.steady || !variant.held {
         true => None,
         false => {
             let vary = paths.iter().cloned().chain([held::POLE.to_string()]).collect();
@@ -727,13 +742,14 @@ fn items(
 }
 
 /// The columns of the recording beside time, with a value for each row.
-fn columns(variant: &Variant) -> Vec<(String, Unit, Vec<f64>)> {
+fn columns(variant: &Variant) -> Vec<(String, Unit, Arc<[f64]>)> {
     // A steady point is held from one time to another.
     let every = if variant.steady { 2 } else { 1 };
     let tables = variant.system.tables.iter().filter(|table| table.y.len() == every * variant.rows.len());
     let column = |table: &crate::frontend::system::Table| {
         let name = table.name.strip_prefix("data.").filter(|name| *name != "t")?;
-        Some((format!("data.{name}"), table.y_unit.clone(), table.y.iter().step_by(every).copied().collect()))
+        let y = if every == 1 { table.y.clone() } else { table.y.iter().step_by(every).copied().collect() };
+        Some((format!("data.{name}"), table.y_unit.clone(), y))
     };
     tables.filter_map(column).collect()
 }

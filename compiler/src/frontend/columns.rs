@@ -13,6 +13,7 @@
 
 use crate::frontend::names::nearest;
 use abi::unit::Unit;
+use std::borrow::Cow;
 
 /// Columns of a file.
 #[derive(Debug, PartialEq)]
@@ -79,6 +80,10 @@ pub fn read(text: &str, wanted: &[Selector]) -> Result<Columns, Fault> {
     let mut places: Vec<Option<usize>> = Vec::new();
     let mut first_after_heading = false;
     let mut decimals = None;
+    // A column that grows would be copied, and take twice its room.
+    let lines = text.bytes().filter(|byte| *byte == b'\n').count() + 1;
+    let used = out.numbers.iter_mut().zip(wanted).filter(|(_, one)| **one != Selector::Unused);
+    used.for_each(|(numbers, _)| numbers.reserve_exact(lines));
     for (row, line) in text.lines().enumerate() {
         let at = row + 1;
         let line = line.trim_start_matches('\u{feff}');
@@ -221,8 +226,8 @@ fn found(headings: &[Heading], wanted: &[Selector], line: &str) -> Result<Vec<Op
 }
 
 /// A cell, and whether it was quoted.
-struct Cell {
-    text: String,
+struct Cell<'a> {
+    text: Cow<'a, str>,
     quoted: bool,
 }
 
@@ -239,39 +244,45 @@ fn separator_of(line: &str) -> Option<char> {
 }
 
 /// The cells of a line. An empty cell after the last separator is ignored.
-fn split(line: &str, separator: Option<char>) -> Vec<Cell> {
-    let mut cells = vec![Cell { text: String::new(), quoted: false }];
-    let mut inside = false;
-    for c in line.chars() {
-        let cell = cells.last_mut().expect("there is one");
-        match c {
-            '"' => {
-                inside = !inside;
-                cell.quoted = true;
-            }
-            c if !inside && Some(c) == separator => cells.push(Cell { text: String::new(), quoted: false }),
-            c if !inside && separator.is_none() && c.is_whitespace() => {
-                if !cell.text.is_empty() {
-                    cells.push(Cell { text: String::new(), quoted: false });
-                }
-            }
-            c => cell.text.push(c),
-        }
-    }
-    for cell in &mut cells {
-        cell.text = cell.text.trim().to_string();
-    }
+fn split(line: &str, separator: Option<char>) -> Vec<Cell<'_>> {
+    let mut cells = match separator.filter(|_| !line.contains('"')) {
+        Some(separator) => line.split(separator).map(|cell| Cell { text: cell.trim().into(), quoted: false }).collect(),
+        None => quoted(line, separator),
+    };
     if cells.len() > 1 && cells.last().is_some_and(|cell| cell.text.is_empty() && !cell.quoted) {
         cells.pop();
     }
     cells
 }
 
+/// The cells of a line in which quotes may hold separators, or blanks are these.
+fn quoted(line: &str, separator: Option<char>) -> Vec<Cell<'static>> {
+    let mut cells = vec![(String::new(), false)];
+    let mut inside = false;
+    for c in line.chars() {
+        let (text, quoted) = cells.last_mut().expect("there is one");
+        match c {
+            '"' => {
+                inside = !inside;
+                *quoted = true;
+            }
+            c if !inside && Some(c) == separator => cells.push((String::new(), false)),
+            c if !inside && separator.is_none() && c.is_whitespace() => {
+                if !text.is_empty() {
+                    cells.push((String::new(), false));
+                }
+            }
+            c => text.push(c),
+        }
+    }
+    cells.into_iter().map(|(text, quoted)| Cell { text: text.trim().to_string().into(), quoted }).collect()
+}
+
 /// A finite number, and whether it has a decimal comma.
 fn number(cell: &Cell, separator: Option<char>) -> Option<(f64, bool)> {
     let commas = cell.text.matches(',').count();
     let comma = commas == 1 && !cell.text.contains('.') && (separator != Some(',') || cell.quoted);
-    let text = if comma { cell.text.replace(',', ".") } else { cell.text.clone() };
+    let text = if comma { cell.text.replace(',', ".").into() } else { Cow::Borrowed(&*cell.text) };
     let finite = text.parse().ok().filter(|x: &f64| x.is_finite());
     finite.map(|x| (x, comma))
 }

@@ -10,6 +10,7 @@ use abi::unit::{Angle, Dimension, Unit};
 use grammar::ast::{BinaryOp, Name};
 use grammar::diagnostic::Diagnostic;
 use grammar::span::Span;
+use std::sync::Arc;
 
 /// Index of a node in the arena.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Debug)]
@@ -446,10 +447,17 @@ pub struct Table {
     pub smooth: bool,
     /// Whether each value holds up to the next argument, rather than changing linearly.
     pub held: bool,
-    /// Arguments, in SI units.
-    pub x: Vec<f64>,
+    /// Arguments, in SI units. The columns of a recording share them.
+    pub x: Arc<[f64]>,
     /// Values, in SI units.
-    pub y: Vec<f64>,
+    pub y: Arc<[f64]>,
+}
+
+impl Table {
+    /// Whether it is a column of a recording, which is read at times alone. A name in a text has no point.
+    pub fn is_recorded(&self) -> bool {
+        self.name.starts_with("data.")
+    }
 }
 
 /// E0204 for `allow` with a name that is no lint.

@@ -63,8 +63,8 @@ pub fn read(
         y_unit,
         smooth: table.shape == TableShape::Smooth,
         held: false,
-        x,
-        y,
+        x: x.into(),
+        y: y.into(),
     })
 }
 
@@ -88,7 +88,10 @@ pub fn columns(
         }
     };
     let names: Vec<Selector> = wanted.iter().map(|(one, _)| *one).collect();
-    let read = match columns::read(&text, &names) {
+    let read = columns::read(&text, &names);
+    // A long recording is as large as its columns.
+    drop(text);
+    let read = match read {
         Ok(read) => read,
         Err(columns::Fault { what, help }) => {
             let error = Diagnostic::error("E0903", format!("\"{}\" does not fit", path.text)).label(path.span, what);
@@ -103,7 +106,8 @@ pub fn columns(
         return None;
     }
     let mut out = Vec::new();
-    for (k, ((numbers, stated), (_, unit))) in read.numbers.iter().zip(&read.units).zip(wanted).enumerate() {
+    let columns::Columns { numbers, units, places } = read;
+    for (k, ((mut numbers, stated), (_, unit))) in numbers.into_iter().zip(&units).zip(wanted).enumerate() {
         let unit = unit.as_ref().or(stated.as_ref()).cloned().unwrap_or_default();
         let differs = |stated: &&Unit| stated.dimension != unit.dimension || turns::apart(stated, &unit);
         if let Some(stated) = stated.as_ref().filter(differs) {
@@ -111,13 +115,14 @@ pub fn columns(
                 true => "a pure number".to_string(),
                 false => format!("in {unit}"),
             };
-            let column = format!("column {} of \"{}\"", read.places[k], path.text);
+            let column = format!("column {} of \"{}\"", places[k], path.text);
             let message = format!("{column} is {}, not {}", shown(stated), shown(&unit));
             let error = Diagnostic::error("E0903", message).label(path.span, "its heading says so");
             diagnostics.push(error.help("change the unit here, the order of the columns, or the heading of the file"));
             return None;
         }
-        let numbers = numbers.iter().map(|number| stated.as_ref().unwrap_or(&unit).to_si(*number)).collect();
+        let written = stated.as_ref().unwrap_or(&unit);
+        numbers.iter_mut().for_each(|number| *number = written.to_si(*number));
         out.push((numbers, unit));
     }
     Some(out)

@@ -15,7 +15,7 @@ use std::sync::Arc;
 /// on anything else is NaN.
 pub fn evaluate(system: &System, types: &Types, exprs: &[ExprId]) -> Vec<f64> {
     let mut pool = crate::math::POOL.to_vec();
-    let tables = Lookup::place_all(&system.tables, &mut pool);
+    let tables = Lookup::place_all_but_recordings(&system.tables, &mut pool);
     let mut plan = Plan::new(system, types, &[], &[], tables);
     plan.description.pool = Arc::from(pool);
     evaluate_in(&plan, exprs)
@@ -25,7 +25,7 @@ pub fn evaluate(system: &System, types: &Types, exprs: &[ExprId]) -> Vec<f64> {
 /// returns the size of the block; its last slots receive the values.
 pub fn formulas(system: &System, types: &Types, exprs: &[ExprId]) -> (Func, usize) {
     let mut pool = crate::math::POOL.to_vec();
-    let tables = Lookup::place_all(&system.tables, &mut pool);
+    let tables = Lookup::place_all_but_recordings(&system.tables, &mut pool);
     let mut plan = Plan::new(system, types, &[], &[], tables);
     plan.description.pool = Arc::from(pool);
     let mut emit = Emit::new(&plan, "formulas", Phase::Start);
@@ -56,7 +56,7 @@ pub enum ParamValue {
 /// each independent parameter. Values that are not constant during a run are NaN, as in [`evaluate`].
 pub fn of_params(system: &System, types: &Types, sought: &[ParamValue]) -> (Program, Vec<(VarId, Slot)>) {
     let mut pool = crate::math::POOL.to_vec();
-    let tables = Lookup::place_all(&system.tables, &mut pool);
+    let tables = Lookup::place_all_but_recordings(&system.tables, &mut pool);
     let mut plan = Plan::new(system, types, &[], &[], tables);
     plan.description.pool = Arc::from(pool);
     let mut emit = Emit::new(&plan, "of params", Phase::Start);

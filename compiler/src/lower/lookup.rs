@@ -2,7 +2,8 @@
 //!
 //! In: the points of a table. Out: its numbers in the pool, and operations that find the interval by binary search and
 //! evaluate its line or cubic. Beyond the ends the table is constant. All numbers of an interval are adjacent in
-//! memory.
+//! memory. A recording whose rows lie at multiples of one interval has its values alone in the pool, and the interval
+//! follows from the time by a division: a tenth of the memory, and the same bits.
 
 use crate::frontend::system::Table;
 use crate::ir::Value;
@@ -14,11 +15,19 @@ pub struct Lookup {
     first: f64,
     last: f64,
     end: f64,
-    smooth: bool,
-    /// Number of comparisons of the binary search.
-    comparisons: u32,
-    /// Index of the table in the pool: the starts of the intervals, then their rows.
+    /// Index of the table in the pool.
     start: u32,
+    find: Find,
+}
+
+/// How the interval of an argument is found.
+enum Find {
+    /// By binary search with so many comparisons. The pool has the starts of the intervals, then their rows.
+    Search { comparisons: u32, smooth: bool },
+    /// The points lie at k · `width`, k = 0, 1, …. The pool has their values.
+    Divide { width: f64, points: u32, held: bool },
+    /// The pool does not have it.
+    Absent,
 }
 
 /// Length of a row as a power of two. A line has start, width, value and rise; a cubic has start, width, value and the
@@ -32,21 +41,42 @@ impl Lookup {
         tables.iter().map(|table| Lookup::place(table, pool)).collect()
     }
 
+    /// The same for expressions that depend on parameters alone. Recordings are read at times, so they are left out: at any
+    /// argument they are NaN.
+    pub fn place_all_but_recordings(tables: &[Table], pool: &mut Vec<f64>) -> Vec<Lookup> {
+        let place = |table: &Table| match table.is_recorded() {
+            true => Lookup { find: Find::Absent, ..Lookup::of(table, pool.len()) },
+            false => Lookup::place(table, pool),
+        };
+        tables.iter().map(place).collect()
+    }
+
+    /// A table with at least one point, at this place of the pool.
+    fn of(table: &Table, start: usize) -> Lookup {
+        let Table { x, y, smooth, held, .. } = table;
+        let n = x.len();
+        // Arguments of other tables may be states, whose sums later passes regroup.
+        let width = x.get(1).copied().filter(|_| table.is_recorded() && !smooth);
+        let is_multiple = |width: &f64| x.iter().enumerate().all(|(k, x)| *x == k as f64 * width);
+        let find = match width.filter(is_multiple) {
+            Some(width) => Find::Divide { width, points: n as u32, held: *held },
+            None => Find::Search { comparisons: (n - 1).next_power_of_two().trailing_zeros(), smooth: *smooth },
+        };
+        Lookup { first: x[0], last: x[n - 1], end: y[n - 1], start: start as u32, find }
+    }
+
     /// Appends a table with at least one point to the pool.
     fn place(table: &Table, pool: &mut Vec<f64>) -> Lookup {
         let Table { x, y, smooth, held, .. } = table;
-        let n = x.len();
-        let intervals = n - 1;
+        let intervals = x.len() - 1;
         let rows = intervals.next_power_of_two();
-        let lookup = Lookup {
-            first: x[0],
-            last: x[n - 1],
-            end: y[n - 1],
-            smooth: *smooth,
-            comparisons: rows.trailing_zeros(),
-            start: pool.len() as u32,
-        };
+        let lookup = Lookup::of(table, pool.len());
         if intervals == 0 {
+            return lookup;
+        }
+        if let Find::Divide { .. } = lookup.find {
+            pool.reserve_exact(y.len());
+            pool.extend_from_slice(y);
             return lookup;
         }
         // Padding intervals start at ∞, so that no finite number falls into them. ∞ itself does; the last row handles
@@ -70,36 +100,91 @@ impl Lookup {
     /// The table at x. For NaN it is NaN (unless the table has one point).
     pub fn at(&self, x: Value, build: &mut Build) -> Value {
         let [first, last, end] = [self.first, self.last, self.end].map(|number| build.real(number));
-        if self.first == self.last {
-            return end;
-        }
-        let rows = 1 << self.comparisons;
+        let clamped = |build: &mut Build| build.clamp(x, first, last);
+        let value = match self.find {
+            Find::Absent => return build.real(f64::NAN),
+            Find::Search { .. } | Find::Divide { .. } if self.first == self.last => return end,
+            Find::Search { comparisons, smooth } => self.searched(x, &clamped, (comparisons, smooth), build),
+            Find::Divide { width, points, held } => self.divided(&clamped, (width, points, held), build),
+        };
+        let clamped = clamped(build);
+        // The last point belongs to no interval.
+        let ends = build.less_equal(last, clamped);
+        build.select(ends, end, value)
+    }
+
+    /// The value in the interval that a binary search finds.
+    fn searched(
+        &self,
+        x: Value,
+        clamped: &dyn Fn(&mut Build) -> Value,
+        (comparisons, smooth): (u32, bool),
+        build: &mut Build,
+    ) -> Value {
+        let rows = 1 << comparisons;
         let mut row = build.int(0);
-        for comparison in (0..self.comparisons).rev() {
+        for comparison in (0..comparisons).rev() {
             let stride = build.int(1 << comparison);
             let probe = build.int_add(row, stride);
             let begins = build.pool(self.start, rows, probe);
             let is_beyond = build.less_equal(begins, x);
             row = build.select(is_beyond, probe, row);
         }
-        let numbers = if self.smooth { CUBIC } else { LINE };
+        let numbers = if smooth { CUBIC } else { LINE };
         let at = build.shift_left(row, numbers);
         let number = |k: u32, build: &mut Build| build.pool(self.start + rows + k, ((rows - 1) << numbers) + 1, at);
-        let clamped = build.clamp(x, first, last);
+        let clamped = clamped(build);
         let [begin, width, value] = [0, 1, 2].map(|k| number(k, build));
         let offset = build.sub(clamped, begin);
         let s = build.div(offset, width);
-        let coefficients = if self.smooth { 3..6 } else { 3..4 };
+        let coefficients = if smooth { 3..6 } else { 3..4 };
         let mut sum = None;
         for k in coefficients.rev() {
             let coefficient = number(k, build);
             let inner = sum.map_or(coefficient, |sum| build.add(coefficient, sum));
             sum = Some(build.mul(s, inner));
         }
-        let value = build.add(value, sum.expect("there is a coefficient"));
-        // The last point belongs to no interval.
-        let ends = build.less_equal(last, clamped);
-        build.select(ends, end, value)
+        build.add(value, sum.expect("there is a coefficient"))
+    }
+
+    /// The value in interval ⌊x / width⌋. Rounding may miss the interval by one, so the ends of three are compared; they
+    /// are the products that a search would find in the pool, and so all bits are the same.
+    fn divided(
+        &self,
+        clamped: &dyn Fn(&mut Build) -> Value,
+        (width, points, held): (f64, u32, bool),
+        build: &mut Build,
+    ) -> Value {
+        /// A whole number below 2^52 added to this has its binary digits in the last 52 bits.
+        const WHOLE: f64 = 4_503_599_627_370_496.0;
+        let x = clamped(build);
+        let [one, two, scale, inverse] = [1.0, 2.0, width, 1.0 / width].map(|number| build.real(number));
+        let quotient = build.mul(x, inverse);
+        let guess = build.floor(quotient);
+        let [before, after, second] = [build.sub(guess, one), build.add(guess, one), build.add(guess, two)];
+        let ends = [before, guess, after, second].map(|k| build.mul(k, scale));
+        let (is_before, is_after) = (build.less(x, ends[1]), build.less_equal(ends[2], x));
+        let mut chosen = |[below, at, above]: [Value; 3]| {
+            let rest = build.select(is_after, above, at);
+            build.select(is_before, below, rest)
+        };
+        let k = chosen([before, guess, after]);
+        let (begin, end) = (chosen([ends[0], ends[1], ends[2]]), chosen([ends[1], ends[2], ends[3]]));
+        let (whole, digits) = (build.real(WHOLE), build.int((1 << 52) - 1));
+        let sum = build.add(k, whole);
+        let bits = build.to_bits(sum);
+        let row = build.int_and(bits, digits);
+        let value = build.pool(self.start, points, row);
+        let rise = if held {
+            build.real(0.0)
+        } else {
+            let next = build.pool(self.start + 1, points - 1, row);
+            build.sub(next, value)
+        };
+        let (offset, width) = (build.sub(x, begin), build.sub(end, begin));
+        let s = build.div(offset, width);
+        let part = build.mul(s, rise);
+        build.add(value, part)
     }
 }
 
@@ -187,6 +272,57 @@ mod tests {
             }
         }
     }
+
+    /// A recording with even rows, read at its rows, beside them and between them, has the bits of one that is searched.
+    /// Mutants, each fails: without `is_before`; without `is_after`; the width as written in place of the difference.
+    #[test]
+    fn even_recordings_have_the_bits_of_those_that_are_searched() {
+        let seed = std::env::var("FRIC_SEED").ok().and_then(|seed| seed.parse().ok()).unwrap_or(5);
+        let mut random = crate::ir::random::Random(seed);
+        let dimension = Dimension::NONE;
+        for case in 0..60 {
+            let (n, width) = (2 + random.below(3000), random.within(1e-5, 1e-1));
+            let table = |name: &str, x: Vec<f64>, y: &[f64], held| Table {
+                name: name.into(),
+                x_unit: Unit::si(dimension),
+                y_unit: Unit::si(dimension),
+                smooth: false,
+                held,
+                x: x.into(),
+                y: y.into(),
+            };
+            let x: Vec<f64> = (0..n).map(|k| k as f64 * width).collect();
+            let y: Vec<f64> = (0..n).map(|_| random.within(-1.0, 1.0)).collect();
+            let held = random.below(2) == 0;
+            let function = |name: &str| {
+                let mut pool = vec![7.0; 3];
+                let lookup = Lookup::place(&table(name, x.clone(), &y, held), &mut pool);
+                let is_even = matches!(lookup.find, Find::Divide { .. });
+                let mut build = Build::new("read");
+                let at = build.load(Slot(3));
+                let value = lookup.at(at, &mut build);
+                build.store(Slot(4), value);
+                (build.finish(), pool, is_even)
+            };
+            let (even, searched) = (function("data.v"), function("v"));
+            assert!(even.2 && !searched.2, "seed {seed}, case {case}");
+            assert_eq!(even.1.len(), 3 + n, "seed {seed}, case {case}");
+            let beside = |x: f64| [x, x.next_up(), x.next_down(), x + 0.37 * width, x + 0.5 * width];
+            let some = (0..40).map(|_| x[random.below(n)]).flat_map(beside).collect::<Vec<f64>>();
+            let ends = [0.0, -1.0, f64::INFINITY, f64::NEG_INFINITY, f64::NAN, x[n - 1], x[n - 1] + 1.0];
+            for x in some.into_iter().chain(ends.into_iter().flat_map(beside)) {
+                let read = |(func, pool, _): &(crate::ir::Func, Vec<f64>, bool)| {
+                    let mut block = vec![0.0, 0.0, 0.0, x, 0.0];
+                    interpret::run_once(func, &mut block, pool);
+                    block[4]
+                };
+                let (a, b) = (read(&even), read(&searched));
+                let alike = a.to_bits() == b.to_bits() || a.is_nan() && b.is_nan();
+                assert!(alike, "seed {seed}, case {case}: {a} and {b} at {x} of {n} rows every {width}, held: {held}");
+            }
+        }
+    }
+
     /// Mutants, each fails: a held table rises; it takes its next value.
     #[test]
     fn held_tables_keep_a_value_up_to_the_next_point() {

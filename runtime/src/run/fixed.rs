@@ -32,8 +32,11 @@ pub(crate) struct Fixed {
     seen: Vec<Range<usize>>,
     /// Steps at the end of a batch that store all outputs: one if the others leave some out, else none.
     full: u64,
-    /// The same slots without time, and their values after the calls since the last look.
+    /// The slots of a series of calls, and their values after the calls since the last look: what the observer reads apart
+    /// from time, or what its probe reads.
     series: Vec<Slot>,
+    /// Whether the observer reads nothing but by its probe.
+    probes: bool,
     stretch: Stretch,
 }
 
@@ -56,6 +59,16 @@ impl Fixed {
         let slots = rest.observer.slots().iter().chain(rest.observer.probe.slots());
         rest.instance.read_only(slots.clone().copied());
         let full = u64::from(!rest.instance.left_out().is_empty());
+        let probed = rest.observer.probe.slots();
+        let is_kept = |slot: &Slot| [Slot::TIME, Slot::COUNT].contains(slot);
+        let probes = rest.observer.slots().is_empty() && !probed.is_empty() && !probed.iter().any(is_kept);
+        let read = if probes { probed } else { rest.observer.slots() };
+        let mut series: Vec<Slot> = Vec::new();
+        for slot in read.iter().filter(|slot| **slot != Slot::TIME) {
+            if !series.contains(slot) {
+                series.push(*slot);
+            }
+        }
         let mut run = Fixed {
             step,
             total,
@@ -65,7 +78,8 @@ impl Fixed {
             done: 0,
             seen: [Slot::COUNT].iter().chain(slots).map(one).collect(),
             full,
-            series: rest.observer.slots().iter().copied().filter(|slot| *slot != Slot::TIME).collect(),
+            series,
+            probes,
             stretch: Stretch::default(),
             rest,
         };
@@ -167,7 +181,7 @@ impl Stepper for Fixed {
     }
 
     fn series(&self) -> Option<(&[Slot], u64)> {
-        let is_plain = self.each && self.rest.observer.probe.next().is_none();
+        let is_plain = self.each && (self.probes || self.rest.observer.probe.next().is_none());
         is_plain.then(|| (&*self.series, (self.batch - self.full - self.done).min(SERIES)))
     }
 
@@ -177,6 +191,10 @@ impl Stepper for Fixed {
         let (first, step) = ((work.steps + self.done + 1) as f64, self.step);
         let times = |times: &mut [f64]| multiples(first, step, times);
         self.stretch.fill(calls as usize, &times, &self.series, column);
+        if self.probes {
+            observer.probe.take_stretch(&self.stretch, 0.5 * step);
+            return Ok(());
+        }
         if self.stretch.is_finite() {
             observer.see_stretch(&self.stretch);
             return Ok(());

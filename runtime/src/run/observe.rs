@@ -22,17 +22,24 @@ pub(crate) struct Observer {
 }
 
 /// Records the values of some slots at given instants, in ascending order.
-#[derive(Default)]
 pub(crate) struct Probe {
     instants: Vec<f64>,
     slots: Vec<Slot>,
-    /// Row-major, a row for each instant passed.
+    /// Number of instants passed.
+    passed: usize,
+    /// Row-major, a row for each of these.
     values: Vec<f64>,
+}
+
+impl Default for Probe {
+    fn default() -> Probe {
+        Probe::new(&[], &[])
+    }
 }
 
 impl Probe {
     pub(crate) fn new(instants: &[f64], slots: &[Slot]) -> Probe {
-        Probe { instants: instants.to_vec(), slots: slots.to_vec(), values: Vec::new() }
+        Probe { instants: instants.to_vec(), slots: slots.to_vec(), passed: 0, values: Vec::new() }
     }
 
     /// The slots to record.
@@ -42,13 +49,24 @@ impl Probe {
 
     /// The next instant, in s.
     pub(crate) fn next(&self) -> Option<f64> {
-        let row = if self.slots.is_empty() { return None } else { self.values.len() / self.slots.len() };
-        self.instants.get(row).copied()
+        self.instants.get(self.passed).copied().filter(|_| !self.slots.is_empty())
     }
 
     /// Records the values at that instant.
     pub(crate) fn take(&mut self, block: &[f64]) {
         self.values.extend(self.slots.iter().map(|slot| block[slot.index()]));
+        self.passed += 1;
+    }
+
+    /// Records the values at the instants to which a point of a stretch is the nearest. `half`: of a step, in s.
+    pub(crate) fn take_stretch(&mut self, stretch: &Stretch, half: f64) {
+        let columns: Vec<&[f64]> = self.slots.iter().map(|slot| stretch.column(*slot)).collect();
+        for (point, time) in stretch.times().iter().enumerate() {
+            while self.instants.get(self.passed).is_some_and(|instant| *instant < time + half) {
+                self.values.extend(columns.iter().map(|column| column[point]));
+                self.passed += 1;
+            }
+        }
     }
 
     pub(crate) fn values(self) -> Vec<f64> {

@@ -72,7 +72,8 @@ fn asked(args: &args::Fit, loaded: &Loaded, name: &str, compiled: &[compile::Fit
     let asks = compiled.iter().chain(judged).flat_map(|fit| &fit.parts).map(|part| &part.asks);
     let columns = asks.flat_map(|asks| asks.columns.iter().map(|(_, _, values)| values).chain([&asks.rows]));
     let mut asked = format!("fric {}, texts {:016x}\n", env!("CARGO_PKG_VERSION"), Hash::of_texts(loaded));
-    let _ = writeln!(asked, "fit {name}, recordings {:016x}", Hash::of_numbers(columns.flatten()));
+    let _ =
+        writeln!(asked, "fit {name}, recordings {:016x}", Hash::of_numbers(columns.flat_map(|column| column.iter())));
     for set in args.stepped.set.texts() {
         let _ = writeln!(asked, "--set {set}");
     }

@@ -112,7 +112,7 @@ impl<'a> Flattener<'a> {
             return known as u32;
         }
         let y_unit = Unit::si(of.y_unit.dimension.over(of.x_unit.dimension));
-        let y = if of.held { vec![0.0; of.x.len()] } else { differences(&of.x, &of.y) };
+        let y = if of.held { vec![0.0; of.x.len()] } else { differences(&of.x, &of.y) }.into();
         let table = Table { name, x_unit: of.x_unit.clone(), y_unit, smooth: false, held: of.held, x: of.x.clone(), y };
         self.system.tables.push(table);
         self.system.tables.len() as u32 - 1
