@@ -231,6 +231,19 @@ pub fn write(path: &Path, bytes: &[u8]) -> io::Result<()> {
     write_with(path, &mut |out| out.write_all(bytes), true)
 }
 
+/// As [`write()`], for bytes that need not be in memory together: `content` writes them.
+///
+/// # Errors
+/// As `write`, and those of `content`.
+pub fn write_by(path: &Path, content: &mut Content) -> io::Result<()> {
+    let buffered = &mut |out: &mut dyn Write| {
+        let mut out = io::BufWriter::new(out);
+        content(&mut out)?;
+        out.flush()
+    };
+    write_with(path, buffered, true)
+}
+
 /// As [`write()`], but does not wait for the disk, which takes longer than many a run: for results, which the same command
 /// makes again if the power fails meanwhile.
 ///
@@ -241,7 +254,7 @@ pub fn write_result(path: &Path, bytes: &[u8]) -> io::Result<()> {
 }
 
 /// Writes what a file holds.
-type Content<'c> = dyn FnMut(&mut dyn Write) -> io::Result<()> + 'c;
+pub type Content<'c> = dyn FnMut(&mut dyn Write) -> io::Result<()> + 'c;
 
 fn write_with(path: &Path, content: &mut Content, synced: bool) -> io::Result<()> {
     make_folder_of(path)?;

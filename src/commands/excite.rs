@@ -17,7 +17,7 @@ use grammar::ast::{self, ExperimentStatement, Expr, FitStatement};
 use runtime::fit::cma_es::{self, Search};
 use runtime::fit::information::Information;
 use runtime::fit::unknowns::Scale;
-use runtime::fit::{Elementary, Unknown, Way};
+use runtime::fit::{Elementary, Runs as _, Unknown, Way};
 use runtime::rng::Chance;
 use serde_json::{Value, json};
 use std::collections::BTreeSet;
@@ -293,7 +293,7 @@ impl Design {
         let point = |motion: &Vec<f64>| sets.iter().map(|set| [&set[..], motion].concat()).collect::<Vec<_>>();
         let points: Vec<Vec<f64>> = motions.iter().flat_map(point).collect();
         let part = &self.runs.parts[0];
-        let all = part.sampled(&points, self.steps[0], &part.asks.rows, &slots);
+        let all = part.sampled_all(&points, self.steps[0], &slots);
         let one = |runs: &[Result<Vec<f64>, String>]| {
             let mut out = vec![(f64::INFINITY, f64::NEG_INFINITY); slots.len()];
             for values in runs {
@@ -373,7 +373,7 @@ impl Design {
                 }
             }
         }
-        let all = self.runs.residuals(Way::Whole, &points, &self.steps);
+        let all = self.runs.with(&self.steps).run(Way::Whole, &points);
         let one = |runs: &[Result<Vec<Vec<f64>>, String>]| {
             let column = |pair: &[Result<Vec<Vec<f64>>, String>]| -> Option<Vec<f64>> {
                 let (Ok(up), Ok(down)) = (&pair[0], &pair[1]) else { return None };

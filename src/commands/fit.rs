@@ -33,6 +33,7 @@ use runtime::engine::{self, Continue, Failure};
 use runtime::fit::{Trouble, Way};
 use runtime::package;
 use runtime::run::verdict::Verdict;
+use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
@@ -422,7 +423,7 @@ fn recording(file: &Path, asks: &Asks, given: bool) -> (PathBuf, String) {
 /// `--check`: the differences with the values as they are written.
 fn check(args: &args::Fit, runs: &Runs, loaded: &Loaded, name: &str, terminal: &mut Terminal) -> End {
     let starts: Vec<f64> = runs.unknowns.iter().map(|unknown| unknown.start).collect();
-    match runs.residuals(Way::Whole, &[starts], &runs.steps()).remove(0) {
+    match runs.residuals(Way::Whole, &starts, &runs.steps()) {
         Ok(residuals) => {
             if !args.quiet {
                 terminal.line(&terminal.styled(Style::Bold, name));
@@ -472,24 +473,49 @@ fn written(
     (outcomes, warnings): (&[engine::Outcome], &[Diagnostic]),
     recordings: &[(PathBuf, String)],
 ) -> Result<Vec<PathBuf>, (PathBuf, std::io::Error)> {
-    let mut files: Vec<(PathBuf, Vec<u8>)> = Vec::new();
+    let mut paths = Vec::new();
+    let mut write = |path: PathBuf, content: &mut project::Content| {
+        project::write_by(&path, content).map_err(|error| (path.clone(), error))?;
+        paths.push(path);
+        Ok(())
+    };
+    let bytes = |bytes: Vec<u8>| move |out: &mut dyn Write| out.write_all(&bytes);
     let (args, name) = (question.args, question.name);
     let at = |stem: &str, ending: &str| args.out.join(format!("{stem}.{ending}"));
     let mut shown = Vec::new();
     if let Some(text) = text {
-        files.push((at(name, "fric"), text.into_bytes()));
+        write(at(name, "fric"), &mut bytes(text.into_bytes()))?;
     }
-    files.push((at(name, "json"), format!("{:#}\n", fitted.json(question.file, runs, recordings)).into_bytes()));
+    let json = format!("{:#}\n", fitted.json(question.file, runs, recordings));
+    write(at(name, "json"), &mut bytes(json.into_bytes()))?;
     for (((part, run), outcome), items) in runs.parts.iter().zip(&fitted.runs).zip(outcomes).zip(runs.items()) {
         let asks = &part.asks;
         let stem = if runs.parts.len() > 1 { format!("{name}_{}", asks.label) } else { name.to_string() };
         let mut slots = part.slots.clone();
         slots.extend(asks.items.iter().flat_map(|item| item.sides.iter().flatten().map(|(_, slot)| *slot)));
-        let point = std::slice::from_ref(&fitted.answer.values);
-        if let Ok(values) = part.sampled(point, run.step, &part.instants, &slots).remove(0) {
-            files.push((at(&stem, "csv"), answer::table(asks, &part.instants, &values).into_bytes()));
-            shown.push(page::PageRun { recording: &outcome.recording, rows: values });
-        }
+        let every = page::every(part.instants.len());
+        let mut rows = Vec::new();
+        let mut content = |out: &mut dyn Write| {
+            out.write_all(answer::heading(asks).as_bytes())?;
+            let mut row = 0;
+            let mut fault = None;
+            let mut each = |times: &[f64], values: &[f64]| {
+                let lines = answer::lines(asks, (row, times), values);
+                for (k, values) in values.chunks(slots.len()).enumerate().filter(|(k, _)| (row + k) % every == 0) {
+                    rows.push((row + k, values.to_vec()));
+                }
+                row += times.len();
+                out.write_all(lines.as_bytes()).map_err(|error| fault.insert(error).to_string())
+            };
+            let ran = part.sampled(&fitted.answer.values, run.step, (&part.instants, &slots), &mut each);
+            match (ran, fault) {
+                (Ok(()), _) => Ok(()),
+                (Err(_), Some(error)) => Err(error),
+                (Err(why), None) => Err(std::io::Error::other(why)),
+            }
+        };
+        write(at(&stem, "csv"), &mut content)?;
+        shown.push(page::PageRun { recording: &outcome.recording, rows });
         let plots = &part.varying.plots;
         if !plots.is_empty() {
             let rms = asks.items.iter().zip(&fitted.answer.rms[items]);
@@ -498,18 +524,14 @@ fn written(
             let subtitle = format!("{} fitted to {rows} rows, rms {}", asks.model, rms.join(", "));
             let drawn = Recorded { label: "", plots, recording: &outcome.recording, verdicts: &[] };
             let drawn = figure::figure(&stem, &subtitle, 0, &[drawn]);
-            files.push((at(&stem, "svg"), plot::picture(&drawn, &Look::default(), Kind::Svg)));
+            write(at(&stem, "svg"), &mut bytes(plot::picture(&drawn, &Look::default(), Kind::Svg)))?;
         }
     }
-    if args.report && shown.len() == runs.parts.len() {
+    if args.report {
         let statement = compile::find_fit(question.loaded, name).expect("it has been fitted");
         let text = question.loaded.files.slice(statement.span);
-        files.push((at(name, "html"), page::report(fitted, runs, (name, text), warnings, &shown).into_bytes()));
-    }
-    let mut paths = Vec::new();
-    for (path, bytes) in files {
-        project::write(&path, &bytes).map_err(|error| (path.clone(), error))?;
-        paths.push(path);
+        let page = page::report(fitted, runs, (name, text), warnings, &shown);
+        write(at(name, "html"), &mut bytes(page.into_bytes()))?;
     }
     Ok(paths)
 }

@@ -3,14 +3,15 @@
 //! In: runs, delivered one by one. Out: the outcome of each, bit-identical to running it alone. When a run needs
 //! attention, its block is copied out of the lane and back; when a run ends, its lane takes the next one.
 
-use crate::engine::{Failure, Outcome, bare, ended, failed, start};
-use crate::run::observe::{Observer, Probe};
+use crate::engine::{Failure, Outcome, ended, start};
+use crate::run::observe::Observer;
 use crate::run::outcome::{Continue, Stop};
 use crate::run::stepper::{Rest, Stepper};
 use crate::stretch::copy_column;
 use abi::lanes::{Batch, Lanes};
 use abi::plan::Experiment;
 use abi::{Instance, Slot};
+use std::sync::Arc;
 
 /// The answer to a request for another run.
 pub enum Next<T> {
@@ -59,75 +60,66 @@ pub fn run<T>(
     watch: &mut dyn FnMut(f64) -> Continue,
 ) {
     let mut ended = |tag, rest, result| give(tag, ended(rest, result));
-    observed(lanes, &Observer::new, next, &mut ended, watch);
-}
-
-/// The rows of a run up to where it ended, and how it ended.
-pub type Sampled = (Vec<f64>, Result<(), Failure>);
-
-/// Values of `slots` at instants in s, ascending, row-major, for each of the runs: as [`sample`](crate::engine::sample)
-/// gives them for one, to the bit.
-///
-/// # Panics
-/// As [`engine::run`](crate::engine::run).
-pub fn sample(
-    lanes: &Lanes,
-    runs: Vec<(Instance, Experiment)>,
-    instants: &[f64],
-    slots: &[Slot],
-    watch: &mut dyn FnMut(f64) -> Continue,
-) -> Vec<Sampled> {
-    let mut all: Vec<Option<Sampled>> = runs.iter().map(|_| None).collect();
-    let mut left = runs.into_iter().enumerate();
-    let mut next = |_| match left.next() {
-        Some((number, (instance, experiment))) => Next::Run(number, Box::new((instance, bare(&experiment)))),
-        None => Next::Nothing,
-    };
-    let observer = |experiment: &Experiment| {
-        let mut observer = Observer::new(experiment);
-        observer.probe = Probe::new(instants, slots);
-        observer
-    };
-    let mut give = |number: usize, rest: Rest, result: Result<(), Stop>| {
-        all[number] = Some((rest.observer.probe.values(), result.map_err(failed)));
-    };
-    observed(lanes, &observer, &mut next, &mut give, watch);
-    all.into_iter().map(|one| one.expect("every run ends")).collect()
+    let mut together = Together::new(lanes);
+    while together.round(&Observer::new, next, &mut ended, watch) {}
 }
 
 /// Passes the parts of a run that has ended to the caller.
-type Give<'g, T> = dyn FnMut(T, Rest, Result<(), Stop>) + 'g;
+pub(crate) type Give<'g, T> = dyn FnMut(T, Rest, Result<(), Stop>) + 'g;
 
-/// Runs everything that `next` delivers, each with an observer of its own.
-fn observed<T>(
-    lanes: &Lanes,
-    observer: &dyn Fn(&Experiment) -> Observer,
-    next: &mut dyn FnMut(bool) -> Next<T>,
-    give: &mut Give<T>,
-    watch: &mut dyn FnMut(f64) -> Continue,
-) {
-    let mut batch = Batch::new(lanes.clone());
-    let mut all: Vec<Option<Lane<T>>> = (0..batch.width()).map(|_| None).collect();
-    // Idle lanes whose contents may end a step with a status.
-    let mut astray = vec![true; batch.width()];
-    let mut pool = None;
-    let (mut calm, mut total, mut more) = (0, 0, true);
-    let mut rows: Vec<f64> = Vec::new();
-    loop {
-        let stride = (calm / PART).clamp(1, MOST);
+/// Runs in progress.
+pub(crate) struct Together<T> {
+    batch: Batch,
+    all: Vec<Option<Lane<T>>>,
+    /// Idle lanes whose contents may end a step with a status.
+    astray: Vec<bool>,
+    pool: Option<Arc<[f64]>>,
+    /// Steps since a run last needed attention, and those of all.
+    calm: u64,
+    total: u64,
+    /// Whether there may be further runs.
+    more: bool,
+    /// What the last series read.
+    rows: Vec<f64>,
+}
+
+impl<T> Together<T> {
+    /// Without runs yet.
+    pub(crate) fn new(lanes: &Lanes) -> Together<T> {
+        let batch = Batch::new(lanes.clone());
+        let all = (0..batch.width()).map(|_| None).collect();
+        let astray = vec![true; batch.width()];
+        Together { batch, all, astray, pool: None, calm: 0, total: 0, more: true, rows: Vec::new() }
+    }
+
+    /// The runs in progress.
+    pub(crate) fn courses(&mut self) -> impl Iterator<Item = (&T, &mut dyn Stepper)> {
+        self.all.iter_mut().flatten().map(|lane| (&lane.tag, &mut *lane.course as &mut dyn Stepper))
+    }
+
+    /// Fills idle lanes, each run with an observer of its own, and makes some steps of all. Returns whether there were any.
+    pub(crate) fn round(
+        &mut self,
+        observer: &dyn Fn(&Experiment) -> Observer,
+        next: &mut dyn FnMut(bool) -> Next<T>,
+        give: &mut Give<T>,
+        watch: &mut dyn FnMut(f64) -> Continue,
+    ) -> bool {
+        let Together { batch, all, astray, pool, calm, total, more, rows } = self;
+        let stride = (*calm / PART).clamp(1, MOST);
         for lane in 0..all.len() {
-            while more && all[lane].is_none() {
+            while *more && all[lane].is_none() {
                 match next(all.iter().any(Option::is_some)) {
                     Next::Run(tag, what) => {
                         let observer = observer(&what.1);
-                        all[lane] = begin(tag, *what, observer, &mut batch, (lane, total), give, watch);
+                        all[lane] = begin(tag, *what, observer, batch, (lane, *total), give, watch);
                     }
                     Next::Later => break,
-                    Next::Nothing => more = false,
+                    Next::Nothing => *more = false,
                 }
             }
         }
-        let Some(model) = all.iter().position(Option::is_some) else { break };
+        let Some(model) = all.iter().position(Option::is_some) else { return false };
         // An idle lane computes a copy of an active one, so that it never ends a call early.
         for lane in 0..all.len() {
             if all[lane].is_none() && astray[lane] && stride > 1 {
@@ -140,13 +132,13 @@ fn observed<T>(
         let pool = pool.get_or_insert_with(|| course.instance().description().pool.clone());
         // Runs that read every step read the same slots, because they have the same plan.
         let seen = all.iter().flatten().find_map(|lane| Some(lane.course.series()?.0.to_vec()));
-        let count = (next - total).min(stride);
+        let count = (next - *total).min(stride);
         let done = match &seen {
-            Some(slots) => batch.advance_and_read(pool, count, slots, &mut rows),
+            Some(slots) => batch.advance_and_read(pool, count, slots, rows),
             None => batch.advance(pool, count),
         };
-        let series = Series { slots: seen.as_deref().unwrap_or_default(), rows: &rows, width: batch.width() };
-        total += done;
+        let series = Series { slots: seen.as_deref().unwrap_or_default(), rows, width: batch.width() };
+        *total += done;
         let mut looked = false;
         for (number, place) in all.iter_mut().enumerate() {
             let status = batch.status(number);
@@ -154,17 +146,18 @@ fn observed<T>(
                 astray[number] |= status != 0;
                 continue;
             };
-            if status == 0 && lane.until > total && lane.course.series().is_none() {
+            if status == 0 && lane.until > *total && lane.course.series().is_none() {
                 continue;
             }
             looked |= status != 0;
-            if let Some(result) = lane.look(&mut batch, (number, total), status, &series, watch) {
+            if let Some(result) = lane.look(batch, (number, *total), status, &series, watch) {
                 let lane = place.take().expect("it was there");
                 astray[number] = true;
                 give(lane.tag, lane.course.rest(), result);
             }
         }
-        calm = if looked { 0 } else { calm + done };
+        *calm = if looked { 0 } else { *calm + done };
+        true
     }
 }
 

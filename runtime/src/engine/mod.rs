@@ -8,6 +8,7 @@ pub mod even_grid;
 pub mod estimate;
 pub mod equilibrium;
 pub mod lanes;
+pub mod tiles;
 pub mod sweep;
 
 use crate::coupling::sil;
@@ -21,6 +22,7 @@ use crate::solver::adaptive::Adaptive;
 use abi::description::Kind;
 use abi::plan::Experiment;
 use abi::{Instance, Slot};
+use std::sync::Arc;
 
 /// Runs an experiment on an instance whose parameters and inputs are set.
 ///
@@ -73,7 +75,7 @@ pub fn sample(
 ) -> (Vec<f64>, Result<(), Failure>) {
     let bare = bare(experiment);
     let mut observer = Observer::new(&bare);
-    observer.probe = Probe::new(instants, slots);
+    observer.probe = Probe::new(&Arc::from(instants), slots);
     let (rest, result) = go(instance, &bare, observer, &mut |_| (), watch);
     (rest.observer.probe.values(), result.map_err(failed))
 }
@@ -99,12 +101,12 @@ pub fn every_step(
 }
 
 /// The experiment without measures and recordings.
-fn bare(experiment: &Experiment) -> Experiment {
+pub(crate) fn bare(experiment: &Experiment) -> Experiment {
     Experiment { expects: Vec::new(), ..experiment.unrecorded() }
 }
 
 /// A failure of a run that records nothing.
-fn failed(stop: Stop) -> Failure {
+pub(crate) fn failed(stop: Stop) -> Failure {
     Failure { cause: stop.cause, time: stop.time, recording: Recording::default() }
 }
 

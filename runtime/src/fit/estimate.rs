@@ -12,21 +12,50 @@
 use crate::fit::journal::{Journal, Numbers, Stage, of_list, of_noise};
 use crate::fit::least_squares::{Triangle, singular};
 use crate::fit::loss;
-use crate::fit::noise::Noise;
+use crate::fit::noise::{Noise, Whitening};
 use crate::fit::quantiles;
-use crate::fit::sandwich::{Stretch, scatter};
+use crate::fit::sandwich::{Correlation, Stretch, Windows};
 use crate::fit::trust_region::{Ended, Limits, Objective, minimise};
 use crate::fit::unknowns::{Elementary, Scale, Unknown};
 use crate::rng::Chance;
 use std::collections::BTreeMap;
 use std::ops::Range;
+use std::rc::Rc;
 
 /// Differences between model and measurement: for each item, a number for each row.
 pub type Residuals = Vec<Vec<f64>>;
 
-/// Runs the model in this way with each of these sets of values, in SI, in the order of the unknowns. An error says why
-/// a run failed.
-pub type Runs<'a> = dyn FnMut(Way, &[Vec<f64>]) -> Vec<Result<Residuals, String>> + 'a;
+/// Runs the model.
+pub trait Runs {
+    /// Runs it in this way with each of these sets of values, in SI, in the order of the unknowns. An error says why a run
+    /// failed.
+    fn run(&mut self, way: Way, points: &[Vec<f64>]) -> Vec<Result<Residuals, String>>;
+
+    /// The same for more runs than fit into memory: passes their residuals some rows after the other.
+    fn pass(&mut self, way: Way, points: &[Vec<f64>], each: &mut dyn FnMut(&Tile)) -> Vec<Result<(), String>> {
+        let all = self.run(way, points);
+        let items = all.iter().flatten().map(Vec::len).next().unwrap_or(0);
+        let rows = all.iter().map(|one| one.as_deref().ok()).collect();
+        each(&Tile { items: 0..items, rows, is_all: true });
+        all.into_iter().map(|one| one.map(|_| ())).collect()
+    }
+}
+
+impl<F: FnMut(Way, &[Vec<f64>]) -> Vec<Result<Residuals, String>>> Runs for F {
+    fn run(&mut self, way: Way, points: &[Vec<f64>]) -> Vec<Result<Residuals, String>> {
+        self(way, points)
+    }
+}
+
+/// The next rows of some compared quantities.
+pub struct Tile<'t> {
+    /// The quantities.
+    pub items: Range<usize>,
+    /// For each run the rows of each of them; none if it has failed.
+    pub rows: Vec<Option<&'t [Vec<f64>]>>,
+    /// Whether these are all their rows.
+    pub is_all: bool,
+}
 
 /// Runs the model with these values, in SI, and shorter steps: for one recording after the other, its items, and what
 /// they leave then. An error says why a run failed.
@@ -94,7 +123,7 @@ pub struct Question<'a> {
     /// What is known of other minima.
     pub minima: Minima,
     /// Runs the model.
-    pub run: &'a mut Runs<'a>,
+    pub run: &'a mut (dyn Runs + 'a),
     /// Runs it with shorter steps, where their effect on the values is of interest.
     pub finer: Option<&'a mut Finer<'a>>,
     /// Elementary functions.
@@ -403,7 +432,7 @@ enum Edge {
 /// The state of a search.
 struct Search<'a> {
     scale: Scale<'a>,
-    run: &'a mut Runs<'a>,
+    run: &'a mut (dyn Runs + 'a),
     /// How the model is run at present.
     way: Way,
     /// In a stage of a path: each coordinate is expected within one unit of this point.
@@ -416,7 +445,7 @@ struct Search<'a> {
     /// Sizes of the differences.
     sizes: Vec<f64>,
     /// The last point that was run, with its residuals.
-    last: Option<(Vec<f64>, Residuals)>,
+    last: Option<(Vec<f64>, Rc<Residuals>)>,
     /// Unknowns that have changed something.
     influence: Vec<bool>,
     runs: u64,
@@ -470,22 +499,21 @@ impl Search<'_> {
         self.scale.values(x)
     }
 
-    fn run_all(&mut self, points: &[Vec<f64>]) -> Vec<Result<Residuals, String>> {
-        let values: Vec<Vec<f64>> = points.iter().map(|x| self.values(x)).collect();
-        self.runs += values.len() as u64;
-        let all = (self.run)(self.way, &values);
-        assert_eq!(all.len(), values.len(), "a result for each run");
+    /// Counts runs and those that failed. `again`: the points have been run before.
+    fn count<T>(&mut self, all: &[Result<T, String>], again: bool) {
+        self.runs += if again { 0 } else { all.len() as u64 };
         for why in all.iter().filter_map(|one| one.as_ref().err()) {
             *self.failures.entry(why.clone()).or_default() += 1;
         }
-        all
     }
 
-    fn residuals(&mut self, x: &[f64]) -> Result<Residuals, String> {
+    fn residuals(&mut self, x: &[f64]) -> Result<Rc<Residuals>, String> {
         if let Some((_, residuals)) = self.last.as_ref().filter(|(at, _)| at == x) {
             return Ok(residuals.clone());
         }
-        let residuals = self.run_all(&[x.to_vec()]).remove(0)?;
+        let mut all = self.run.run(self.way, &[self.scale.values(x)]);
+        self.count(&all, false);
+        let residuals = Rc::new(all.remove(0)?);
         self.last = Some((x.to_vec(), residuals.clone()));
         Ok(residuals)
     }
@@ -546,13 +574,9 @@ impl Search<'_> {
         for first in (0..starts.len()).step_by(JUDGED_AT_ONCE) {
             let some = &starts[first..starts.len().min(first + JUDGED_AT_ONCE)];
             let stage = self.staged(|search| {
-                let (mut all, mut rows) = (Vec::new(), 0);
-                for (k, residuals) in search.run_all(some).into_iter().enumerate() {
-                    let Ok(residuals) = residuals else { continue };
-                    rows = residuals.iter().map(Vec::len).sum();
-                    all.extend([(first + k) as f64, search.misfit(items, &residuals)]);
-                }
-                Ok([vec![rows as f64], all].concat())
+                let (misfits, rows) = search.misfits_at(items, some);
+                let all = misfits.into_iter().enumerate().filter_map(|(k, misfit)| Some([(first + k) as f64, misfit?]));
+                Ok([vec![rows as f64], all.flatten().collect()].concat())
             });
             let stage = stage.unwrap_or_default();
             let Some((count, all)) = stage.split_first() else { continue };
@@ -568,16 +592,45 @@ impl Search<'_> {
         Ok((misfits.into_iter().map(|(k, _)| starts[k].clone()).collect(), rows))
     }
 
-    /// How badly a start fits. Large residuals count little, so that a run that goes astray is bad and not infinitely bad.
-    fn misfit(&self, items: &[Item], residuals: &Residuals) -> f64 {
-        let of = |(item, rows): (&Item, &Vec<f64>)| -> f64 {
-            let (floor, scale) = match item.sd {
-                Some(sd) => (1.0, 1.0 / (sd * sd)),
-                None => ((1e-6 * mean_square(rows)).max(f64::MIN_POSITIVE), 1.0),
-            };
-            rows.iter().map(|r| (self.scale.with.log)(floor + scale * r * r)).sum()
-        };
-        items.iter().zip(residuals).map(of).sum()
+    /// How badly some starts fit, and the number of residuals of each; none for those that cannot be run.
+    fn misfits_at(&mut self, items: &[Item], starts: &[Vec<f64>]) -> (Vec<Option<f64>>, usize) {
+        let (with, way) = (&self.scale.with, self.way);
+        let values: Vec<Vec<f64>> = starts.iter().map(|x| self.values(x)).collect();
+        let zeros = vec![vec![0.0; items.len()]; starts.len()];
+        // Of each start and item: the sum of squares, and the misfit.
+        let (mut squares, mut misfits, mut rows, mut is_known) = (zeros.clone(), zeros, vec![0; items.len()], true);
+        let ended = self.run.pass(way, &values, &mut |tile| {
+            let count =
+                |item: usize| tile.rows.iter().flatten().map(|rows: &&[Vec<f64>]| rows[item].len()).next().unwrap_or(0);
+            for (item, k) in tile.items.clone().enumerate() {
+                rows[k] += count(item);
+                for (start, residuals) in tile.rows.iter().enumerate() {
+                    let Some(residuals) = residuals.map(|residuals| &residuals[item]) else { continue };
+                    squares[start][k] = residuals.iter().fold(squares[start][k], |sum, r| sum + r * r);
+                    match (tile.is_all, items[k].sd) {
+                        (true, _) => misfits[start][k] = misfit(&items[k], mean_square(residuals), residuals, with),
+                        (false, Some(_)) => misfits[start][k] += misfit(&items[k], 1.0, residuals, with),
+                        (false, None) => is_known = false,
+                    }
+                }
+            }
+        });
+        // The scale of a misfit is known once all rows are.
+        if !is_known {
+            self.run.pass(way, &values, &mut |tile| {
+                for (item, k) in tile.items.clone().enumerate().filter(|(_, k)| !tile.is_all && items[*k].sd.is_none())
+                {
+                    for (start, residuals) in tile.rows.iter().enumerate() {
+                        let Some(residuals) = residuals.map(|residuals| &residuals[item]) else { continue };
+                        let mean = squares[start][k] / rows[k].max(1) as f64;
+                        misfits[start][k] += misfit(&items[k], mean, residuals, with);
+                    }
+                }
+            });
+        }
+        self.count(&ended, false);
+        let misfits = ended.iter().zip(misfits).map(|(ended, all)| ended.is_ok().then(|| all.iter().sum()));
+        (misfits.collect(), rows.iter().sum())
     }
 
     /// Searches from a start with white noise, weighted by its size in each item, until the weights settle. None if the
@@ -601,7 +654,7 @@ impl Search<'_> {
                     Some(sd) => rows.len() as f64 * mean_square(rows) / (sd * sd),
                     None => rows.len() as f64 * (self.scale.with.log)(mean_square(rows).max(f64::MIN_POSITIVE)),
                 };
-                let misfit = items.iter().zip(&residuals).map(of).sum();
+                let misfit = items.iter().zip(&*residuals).map(of).sum();
                 return Ok(Some(Followed { x: end.x, why: end.why, noise: self.noise.clone(), misfit }));
             }
         }
@@ -656,81 +709,143 @@ impl Search<'_> {
         self.noise.iter().zip(&before).any(changes)
     }
 
-    /// Whitened residuals of all items, one after the other, then what is known beforehand.
-    fn white(&self, x: &[f64], residuals: &Residuals) -> Vec<f64> {
-        let mut all: Vec<f64> =
-            self.noise.iter().zip(residuals).flat_map(|(noise, residuals)| noise.whitened(residuals)).collect();
+    /// What is known beforehand, as residuals.
+    fn known(&self, x: &[f64]) -> Vec<f64> {
         let values = self.values(x);
         let known = self.scale.unknowns.iter().zip(values).filter_map(|(unknown, value)| {
             let (expected, sd) = unknown.known?;
             Some((value - expected) / sd)
         });
-        all.extend(known);
-        all.extend(self.prior.iter().flat_map(|prior| x.iter().zip(prior).map(|(x, prior)| x - prior)));
-        all
+        let prior = self.prior.iter().flat_map(|prior| x.iter().zip(prior).map(|(x, prior)| x - prior));
+        known.chain(prior).collect()
     }
 
-    /// The bounds of whitened residuals; what is known beforehand has none.
-    fn bounds(&self, residuals: &Residuals) -> impl Iterator<Item = f64> {
-        let one = |(noise, rows): (&Noise, &Vec<f64>)| std::iter::repeat_n(noise.bound, noise.kept(rows.len()).count());
-        let all: Vec<_> = self.noise.iter().zip(residuals).map(one).collect();
-        all.into_iter().flatten().chain(std::iter::repeat(f64::INFINITY))
+    /// The bounds of the whitened residuals of each item, beyond which they count by their size.
+    fn bounds(&self) -> Vec<f64> {
+        self.noise.iter().map(|noise| if self.robust { noise.bound } else { f64::INFINITY }).collect()
     }
 
-    /// The loss of whitened residuals: their sum of squares, in least squares.
-    fn loss(&self, white: &[f64], residuals: &Residuals) -> f64 {
-        white.iter().zip(self.bounds(residuals)).map(|(r, bound)| loss::loss(*r, bound)).sum()
+    /// The loss of the whitened residuals of all items and of what is known beforehand: their sum of squares, in least
+    /// squares. Then the sum of squares of the rows as they are weighted, and their number.
+    fn sums(&self, x: &[f64], residuals: &Residuals) -> (f64, f64, usize) {
+        let white = self.noise.iter().zip(residuals).zip(self.bounds());
+        let white = white.flat_map(|((noise, residuals), bound)| noise.whitening(residuals).map(move |r| (r, bound)));
+        let known = self.known(x).into_iter().map(|r| (r, f64::INFINITY));
+        white.chain(known).fold((0.0, 0.0, 0), |(loss, square, count), (r, bound)| {
+            let weighted = loss::root_weight(r, bound) * r;
+            (loss + loss::loss(r, bound), square + weighted * weighted, count + 1)
+        })
     }
 
-    /// Weighs rows of the Jacobian and of the whitened residuals, so that they have the gradient of the loss.
-    fn weighted(&self, columns: &mut [Vec<f64>], white: &mut [f64], residuals: &Residuals) {
-        if self.robust {
-            for (row, bound) in (0..white.len()).zip(self.bounds(residuals)) {
-                let weight = loss::root_weight(white[row], bound);
-                white[row] *= weight;
-                columns.iter_mut().for_each(|column| column[row] *= weight);
+    /// Columns of the Jacobian of the whitened residuals, by differences, some rows after the other; none if the model
+    /// cannot be run around this point. `parts`: sizes of the differences as fractions, each with columns of its own.
+    /// `again`: the same has been asked before. The rows are added to what `new` makes, in their order.
+    fn jacobian<A>(
+        &mut self,
+        x: &[f64],
+        (parts, again): (&[f64], bool),
+        new: &dyn Fn() -> A,
+        add: &mut dyn FnMut(&mut A, &Piece),
+    ) -> Option<A> {
+        let n = x.len();
+        let middle = self.residuals(x).ok()?;
+        let mut points: Vec<Vec<f64>> = Vec::new();
+        for (part, k) in parts.iter().flat_map(|part| (0..n).map(move |k| (part, k))) {
+            for by in [part * self.sizes[k], -part * self.sizes[k]] {
+                let mut moved = x.to_vec();
+                moved[k] = (x[k] + by).clamp(self.low[k], self.high[k]);
+                points.push(moved);
             }
         }
-    }
-
-    /// Columns of the Jacobian of the whitened residuals, by differences of these sizes; none if the model cannot be run
-    /// around this point. `part`: their size as a fraction.
-    fn columns(&mut self, x: &[f64], part: f64) -> Option<Vec<Vec<f64>>> {
-        let n = x.len();
-        let moved = |k: usize, by: f64| {
-            let mut moved = x.to_vec();
-            moved[k] = (x[k] + by).clamp(self.low[k], self.high[k]);
-            moved
-        };
-        let points: Vec<Vec<f64>> =
-            (0..n).flat_map(|k| [moved(k, part * self.sizes[k]), moved(k, -part * self.sizes[k])]).collect();
-        let results = self.run_all(&points);
-        let middle = self.residuals(x).ok()?;
-        let at = |k: usize, this: &Self| results[k].as_ref().ok().map(|residuals| this.white(&points[k], residuals));
-        let mut columns = Vec::new();
-        for k in 0..n {
-            let (above, below) = (at(2 * k, self), at(2 * k + 1, self));
-            let (from, to) = match (&above, &below) {
-                (Some(_), Some(_)) => (points[2 * k + 1][k], points[2 * k][k]),
-                (Some(_), None) => (x[k], points[2 * k][k]),
-                (None, Some(_)) => (points[2 * k + 1][k], x[k]),
-                (None, None) => return None,
-            };
-            let centre = self.white(x, &middle);
-            let (above, below) = (above.unwrap_or_else(|| centre.clone()), below.unwrap_or(centre));
-            let inverse = 1.0 / (to - from);
-            columns.push(above.iter().zip(&below).map(|(a, b)| inverse * (a - b)).collect());
-            let raw = |k: usize| results[k].as_ref().unwrap_or(&middle);
-            self.influence[k] |= raw(2 * k) != raw(2 * k + 1);
+        let mut again = again;
+        loop {
+            let values: Vec<Vec<f64>> = points.iter().map(|x| self.values(x)).collect();
+            let inverse = |at: usize| 1.0 / (points[2 * at][at % n] - points[2 * at + 1][at % n]);
+            let inverses: Vec<f64> = (0..parts.len() * n).map(inverse).collect();
+            let mut sum = new();
+            let Search { run, noise, influence, .. } = self;
+            let filters = || noise.iter().map(Whitening::new).collect::<Vec<_>>();
+            let (mut own, mut moved): (Vec<_>, Vec<_>) = (filters(), points.iter().map(|_| filters()).collect());
+            let mut begins = vec![0; noise.len()];
+            let mut changed = vec![false; n];
+            let ended = run.pass(self.way, &values, &mut |tile| {
+                // What is added would be in vain once a run has failed.
+                let Some(rows) = tile.rows.iter().copied().collect::<Option<Vec<&[Vec<f64>]>>>() else { return };
+                for (item, k) in tile.items.clone().enumerate() {
+                    let range = begins[k]..begins[k] + rows[0][item].len();
+                    begins[k] = range.end;
+                    let white = own[k].of(&middle[k][range.clone()]);
+                    let column = |at: usize| {
+                        let (above, below) = (&rows[2 * at][item], &rows[2 * at + 1][item]);
+                        changed[at % n] |= above != below;
+                        let (above, below) = (moved[2 * at][k].of(above), moved[2 * at + 1][k].of(below));
+                        above.iter().zip(&below).map(|(a, b)| inverses[at] * (a - b)).collect::<Vec<f64>>()
+                    };
+                    let columns: Vec<Vec<f64>> = (0..parts.len() * n).map(column).collect();
+                    add(&mut sum, &Piece { item: Some(k), range, white, columns });
+                }
+            });
+            let failed: Vec<usize> = (0..ended.len()).filter(|at| ended[*at].is_err()).collect();
+            if failed.is_empty() {
+                influence.iter_mut().zip(changed).for_each(|(has, changed)| *has |= changed);
+            }
+            self.count(&ended, again);
+            if failed.is_empty() {
+                let known: Vec<Vec<f64>> = points.iter().map(|x| self.known(x)).collect();
+                let column = |at: usize| {
+                    let pairs = known[2 * at].iter().zip(&known[2 * at + 1]);
+                    pairs.map(|(a, b)| inverses[at] * (a - b)).collect::<Vec<f64>>()
+                };
+                let columns = (0..parts.len() * n).map(column).collect();
+                add(&mut sum, &Piece { item: None, range: 0..0, white: self.known(x), columns });
+                return Some(sum);
+            }
+            // Where one side cannot be run, the difference to the middle takes its place.
+            for at in failed {
+                points[at] = x.to_vec();
+                if points[at ^ 1] == x {
+                    return None;
+                }
+            }
+            again = true;
         }
-        Some(columns)
     }
 
-    /// Chooses the sizes of the next differences from the lengths of the columns.
-    fn size(&mut self, columns: &[Vec<f64>]) {
-        for (size, column) in self.sizes.iter_mut().zip(columns) {
-            let length = column.iter().map(|c| c * c).sum::<f64>().sqrt();
-            *size = (PART_OF_NOISE / length).clamp(DIFFERENCES.0, DIFFERENCES.1);
+    /// The Jacobian and what follows from it. `parts`: as in [`Search::jacobian`]; the first one counts.
+    fn linear(&mut self, items: &[Item], x: &[f64], parts: &[f64]) -> Option<Linear> {
+        let stretches = {
+            let residuals = self.residuals(x).ok()?;
+            self.stretches(items, &residuals)
+        };
+        let n = x.len();
+        let sizes = self.sizes.clone();
+        let new = || Linear::new(n, &stretches, &sizes);
+        self.jacobian(x, (parts, false), &new, &mut Linear::add)
+    }
+
+    /// Passes the columns of a Jacobian once more: from memory, where they are there, else from new runs.
+    fn once_more<A>(
+        &mut self,
+        x: &[f64],
+        linear: &Linear,
+        new: &dyn Fn() -> A,
+        add: &mut dyn FnMut(&mut A, &Piece),
+    ) -> Option<A> {
+        let Some(kept) = &linear.kept else {
+            let sizes = std::mem::replace(&mut self.sizes, linear.sizes.clone());
+            let sum = self.jacobian(x, (&[1.0], true), new, add);
+            self.sizes = sizes;
+            return sum;
+        };
+        let mut sum = new();
+        kept.iter().for_each(|piece| add(&mut sum, piece));
+        Some(sum)
+    }
+
+    /// Chooses the sizes of the next differences from the sums of squares of the columns.
+    fn size(&mut self, squares: &[f64]) {
+        for (size, square) in self.sizes.iter_mut().zip(squares) {
+            *size = (PART_OF_NOISE / square.sqrt()).clamp(DIFFERENCES.0, DIFFERENCES.1);
         }
     }
 
@@ -748,29 +863,47 @@ impl Search<'_> {
             Some(residuals)
         };
         let found = at(x).and_then(|moved| Some((moved, at(plain)?)));
-        let is_larger = found.is_some_and(|(moved, residuals)| {
-            let mut white = self.white(plain, &residuals);
-            let square = |rows: &[f64]| rows.iter().map(|r| r * r).sum::<f64>();
-            let degrees = (white.len() as f64 - n as f64).max(1.0);
-            let rise = self.loss(&self.white(x, &moved), &moved) - self.loss(&white, &residuals);
-            let Some(mut columns) = self.columns(plain, 1.0).filter(|_| rise > 0.0) else { return false };
-            self.weighted(&mut columns, &mut white, &residuals);
-            // In units of the variance of the rows.
-            let rise = rise / (square(&white) / degrees);
+        let is_larger = found.is_some_and(|(found, residuals)| {
+            let ((here, square, count), (there, ..)) = (self.sums(plain, &residuals), self.sums(x, &found));
+            let stretches = self.stretches(items, &residuals);
+            drop((found, residuals));
+            let degrees = (count as f64 - n as f64).max(1.0);
+            let rise = there - here;
             // What is at a bound does not scatter.
-            let free = (0..n).filter(|k| self.at_bound(plain, *k).is_none());
-            let columns: Vec<Vec<f64>> = free.map(|k| columns[k].clone()).collect();
-            if columns.is_empty() {
+            let free: Vec<usize> = (0..n).filter(|k| self.at_bound(plain, *k).is_none()).collect();
+            let Some(linear) = self.linear(items, plain, &[1.0]).filter(|_| rise > 0.0) else { return false };
+            if free.is_empty() {
                 return false;
             }
-            let triangle = reduced(&columns, &white);
-            let of_r = |k: usize| (0..columns.len()).map(|row| triangle.r[row * columns.len() + k]).collect();
-            let parts = singular((0..columns.len()).map(of_r).collect(), &triangle.qf);
-            let scattered = scatter(&columns, &white, &self.stretches(items, &residuals));
+            // In units of the variance of the rows.
+            let rise = rise / (square / degrees);
+            let bounds = self.bounds();
+            let of_free = |piece: &Piece| {
+                let (columns, white) =
+                    piece.weighted(&bounds).unwrap_or_else(|| (piece.columns.clone(), piece.white.clone()));
+                (free.iter().map(|k| columns[*k].clone()).collect::<Vec<_>>(), white)
+            };
+            let new = || (Triangle::new(free.len()), stretches.iter().map(Correlation::new).collect::<Vec<_>>());
+            let sums = self.once_more(plain, &linear, &new, &mut |(triangle, correlations), piece| {
+                let (columns, white) = of_free(piece);
+                reduce(triangle, &columns, &white);
+                if let Some(k) = piece.item {
+                    correlations[k].add(&slices(&columns), &white);
+                }
+            });
+            let Some((triangle, correlations)) = sums else { return false };
+            let of_r = |k: usize| (0..free.len()).map(|row| triangle.r[row * free.len() + k]).collect();
+            let parts = singular((0..free.len()).map(of_r).collect(), &triangle.qf);
+            let new = || Windows::new(free.len(), &correlations);
+            let windows = self.once_more(plain, &linear, &new, &mut |windows, piece| {
+                let (columns, white) = of_free(piece);
+                windows.add(piece.item, &slices(&columns), &white);
+            });
+            let Some(scattered) = windows.map(Windows::finish) else { return false };
             let (ratios, stretch) = (scattered.ratios(&parts), scattered.stretch());
             let known = (1..).find(|known| known * known >= ratios.len()).unwrap_or(1);
-            let trace: f64 = (0..known).map(|k| ratios[k * known + k]).sum::<f64>() * degrees / square(&white);
-            let squared: f64 = square(&ratios) * (degrees / square(&white)) * (degrees / square(&white));
+            let trace: f64 = (0..known).map(|k| ratios[k * known + k]).sum::<f64>() * degrees / square;
+            let squared = ratios.iter().map(|r| r * r).sum::<f64>() * (degrees / square) * (degrees / square);
             let (scale, degrees) = (squared / trace, trace * trace / squared);
             quantiles::chi_square_tail(rise / (scale * stretch * stretch), degrees, &self.scale.with) < NO_NOISE
         });
@@ -793,44 +926,63 @@ impl Search<'_> {
         let n = x.len();
         let residuals = self.residuals(x).map_err(Trouble::NoStart)?;
         let failed = |this: &Self| Trouble::NoStart(this.commonest());
-        let Some(first) = self.columns(x, 1.0) else { return Err(failed(&self)) };
-        self.size(&first);
-        let Some(columns) = self.columns(x, 1.0) else { return Err(failed(&self)) };
-        let Some(finer) = self.columns(x, 1.0 / 3.0) else { return Err(failed(&self)) };
-        let length = |column: &[f64]| column.iter().map(|c| c * c).sum::<f64>().sqrt();
-        let differ = |k: &usize| {
-            let gap: Vec<f64> = columns[*k].iter().zip(&finer[*k]).map(|(a, b)| a - b).collect();
-            length(&gap) > ROUGH * length(&columns[*k])
-        };
+        let Some(first) = self.linear(items, x, &[1.0]) else { return Err(failed(&self)) };
+        self.size(&first.squares);
+        drop(first);
+        let Some(mut linear) = self.linear(items, x, &[1.0, 1.0 / 3.0]) else { return Err(failed(&self)) };
+        let differ = |k: &usize| linear.gaps[*k].sqrt() > ROUGH * linear.squares[*k].sqrt();
         let rough: Vec<usize> = (0..n).filter(differ).collect();
         // Where small differences see steps of the model rather than its course, larger ones do not.
-        let columns = match rough.is_empty() {
-            true => columns,
-            false => {
-                rough.iter().for_each(|k| self.sizes[*k] = self.sizes[*k].max(FIRST_DIFFERENCE));
-                self.columns(x, 1.0).unwrap_or(columns)
-            }
-        };
-        let white = self.white(x, &residuals);
-        let mut stretches = self.stretches(items, &residuals);
+        if !rough.is_empty() {
+            rough.iter().for_each(|k| self.sizes[*k] = self.sizes[*k].max(FIRST_DIFFERENCE));
+            linear = self.linear(items, x, &[1.0]).unwrap_or(linear);
+        }
         let uneven = items.iter().any(|item| item.rows == Rows::Uneven);
         let scatters = misfits || uneven;
         let moments: Vec<loss::Moments> = match self.robust {
             true => {
-                let of =
-                    |(stretch, noise): (&Stretch, &Noise)| loss::moments(&white, stretch.rows.clone(), noise.bound, n);
-                stretches.iter().zip(&self.noise).map(of).collect()
+                let of = |(noise, rows): (&Noise, &Vec<f64>)| {
+                    let white = noise.whitened(rows);
+                    loss::moments(&white, 0..white.len(), noise.bound, n)
+                };
+                self.noise.iter().zip(&*residuals).map(of).collect()
             }
             false => Vec::new(),
         };
-        // Rows within their bound alone curve the loss: on average this part of each.
-        let mut columns = columns;
-        for one in &moments {
-            let root = one.within.sqrt();
-            columns.iter_mut().for_each(|column| column[one.rows.clone()].iter_mut().for_each(|cell| *cell *= root));
-        }
-        let triangle = reduced(&columns, &white);
-        let degrees = (white.len() as f64 - n as f64).max(1.0);
+        // Rows within their bound alone curve the loss: on average this part of each. Huber's loss has a sandwich in any
+        // case (Robust Statistics, sec. 7.6): the rows of the gradient are those of half the loss's slope, of which
+        // independent ones count by their mean square.
+        let bounds: Vec<f64> = self.noise.iter().map(|noise| noise.bound).collect();
+        let sloped = |piece: &Piece| -> (Vec<Vec<f64>>, Vec<f64>) {
+            let (mut columns, mut white) = (piece.columns[..n].to_vec(), piece.white.clone());
+            if let Some((k, one)) = piece.item.and_then(|k| Some((k, moments.get(k)?))) {
+                let root = one.within.sqrt();
+                let mean = one.square.sqrt() / root;
+                let slope = |r: f64| if scatters { r.clamp(-bounds[k], bounds[k]) / root } else { mean };
+                columns.iter_mut().flatten().for_each(|cell| *cell *= root);
+                white.iter_mut().for_each(|r| *r = slope(*r));
+            }
+            (columns, white)
+        };
+        let (triangle, correlations) = match self.robust {
+            true => {
+                let mut stretches = self.stretches(items, &residuals);
+                stretches.iter_mut().for_each(|stretch| stretch.independent |= !scatters);
+                let new = || (Triangle::new(n), stretches.iter().map(Correlation::new).collect::<Vec<_>>());
+                let sums = self.once_more(x, &linear, &new, &mut |(triangle, correlations), piece| {
+                    let (columns, white) = sloped(piece);
+                    reduce(triangle, &columns, &piece.white);
+                    if let Some(k) = piece.item {
+                        correlations[k].add(&slices(&columns), &white);
+                    }
+                });
+                let Some(sums) = sums else { return Err(failed(&self)) };
+                sums
+            }
+            false => (linear.triangle.clone(), std::mem::take(&mut linear.correlations)),
+        };
+        let rows = triangle.rows as f64;
+        let degrees = (rows - n as f64).max(1.0);
         let chi_square = triangle.square() / degrees;
         // Where a standard deviation is given, it is not estimated again.
         let given = self.robust || items.iter().any(|item| item.sd.is_some());
@@ -841,19 +993,17 @@ impl Search<'_> {
             let each = parts.values.iter().zip(&parts.vectors);
             each.map(|(s, v)| variance * (v[i] / s) * (v[j] / s)).sum()
         };
-        // Where no model makes the noise white, the scatter of the gradient takes its place. Huber's loss has a sandwich in
-        // any case (Robust Statistics, sec. 7.6): the rows of the gradient are those of half the loss's slope, of which
-        // independent ones count by their mean square.
-        let mut sloped = white.clone();
-        for (one, noise) in moments.iter().zip(&self.noise) {
-            let root = one.within.sqrt();
-            let mean = one.square.sqrt() / root;
-            let slope = |r: f64| if scatters { r.clamp(-noise.bound, noise.bound) / root } else { mean };
-            sloped[one.rows.clone()].iter_mut().for_each(|r| *r = slope(*r));
-        }
-        stretches.iter_mut().for_each(|stretch| stretch.independent |= !scatters);
-        let scattered = (scatters || self.robust).then(|| scatter(&columns, &sloped, &stretches));
-        let small_sample = white.len() as f64 / degrees;
+        // Where no model makes the noise white, the scatter of the gradient takes its place.
+        let windows = || Windows::new(n, &correlations);
+        let scattered = match scatters || self.robust {
+            true => self.once_more(x, &linear, &windows, &mut |windows, piece| {
+                let (columns, white) = sloped(piece);
+                windows.add(piece.item, &slices(&columns), &white);
+            }),
+            false => None,
+        };
+        let scattered = scattered.map(Windows::finish);
+        let small_sample = rows / degrees;
         // Of the combinations of singular vectors i and j.
         let ratios: Option<Vec<f64>> = scattered.as_ref().map(|scattered| {
             let of = |at: usize| scattered.form(&parts.vectors[at / n], &parts.vectors[at % n]) * small_sample;
@@ -883,25 +1033,37 @@ impl Search<'_> {
         };
         let sd: Vec<f64> = (0..n).map(|k| covariance(k, k).sqrt()).collect();
         // Other residuals move the minimum by −(JᵀJ)⁻¹Jᵀ of their change (Gauss and Newton).
-        let moved = |residuals: &Residuals| -> Vec<f64> {
-            let mut change: Vec<f64> = self.white(x, residuals).iter().zip(&white).map(|(a, b)| a - b).collect();
-            for (one, noise) in moments.iter().zip(&self.noise) {
-                let counts = |row: usize| if white[row].abs() <= noise.bound { 1.0 / one.within.sqrt() } else { 0.0 };
-                one.rows.clone().for_each(|row| change[row] *= counts(row));
-            }
-            let parts = singular((0..n).map(of_r).collect(), &reduced(&columns, &change).qf);
+        let moved = |qf: &[f64]| -> Vec<f64> {
+            let parts = singular((0..n).map(of_r).collect(), qf);
             let weights: Vec<f64> =
                 parts.values.iter().zip(&parts.uf).map(|(s, uf)| if *s > 0.0 { uf / s } else { 0.0 }).collect();
             let along = |k: usize| -> f64 { parts.vectors.iter().zip(&weights).map(|(v, w)| -v[k] * w).sum() };
             (0..n).map(|k| slopes[k].iter().map(|(a, slope)| slope * along(*a)).sum::<f64>() / sd[k]).collect()
         };
-        let of_recording = |(items, found): (Range<usize>, Result<Residuals, String>)| {
-            let mut other = residuals.clone();
-            other.splice(items, found?);
-            Ok(moved(&other))
-        };
-        let shifts: Vec<Result<Vec<f64>, String>> =
-            shorter.map_or(Vec::new(), |shorter| shorter(&values).into_iter().map(of_recording).collect());
+        let mut shifts: Vec<Result<Vec<f64>, String>> = Vec::new();
+        for (items, found) in shorter.map_or(Vec::new(), |shorter| shorter(&values)) {
+            let noise = self.noise.clone();
+            let shift = found.and_then(|found| {
+                let new = || (Triangle::new(n), noise.iter().map(Whitening::new).collect::<Vec<_>>());
+                let changed = self.once_more(x, &linear, &new, &mut |(triangle, filters), piece| {
+                    let change: Vec<f64> = match piece.item.filter(|k| items.contains(k)) {
+                        Some(k) => {
+                            let other = filters[k].of(&found[k - items.start][piece.range.clone()]);
+                            let counts = |white: f64| match moments.get(k) {
+                                Some(one) if white.abs() <= bounds[k] => 1.0 / one.within.sqrt(),
+                                Some(_) => 0.0,
+                                None => 1.0,
+                            };
+                            other.iter().zip(&piece.white).map(|(a, b)| (a - b) * counts(*b)).collect()
+                        }
+                        None => vec![0.0; piece.white.len()],
+                    };
+                    reduce(triangle, &sloped(piece).0, &change);
+                });
+                changed.map(|(triangle, _)| moved(&triangle.qf)).ok_or_else(|| self.commonest())
+            });
+            shifts.push(shift);
+        }
         let stretch = scattered.as_ref().map_or(1.0, |scattered| scattered.stretch());
         let t = quantiles::student(level, degrees, &self.scale.with) * stretch;
         // In the scale of each unknown on its own.
@@ -927,12 +1089,15 @@ impl Search<'_> {
         });
         // What is left is described by a model of its correlation, also where the values do not come from it.
         let noise = if misfits { self.noise_of(items, &residuals, true) } else { self.noise.clone() };
+        let at_bound = (0..n).map(at_bound).collect();
+        self.last = None;
+        let residuals = Rc::unwrap_or_clone(residuals);
         Ok(Answer {
             misfits,
             inflation,
             intervals: (0..n).map(interval).collect(),
             correlation: (0..n * n).map(|at| correlation(at / n, at % n)).collect(),
-            at_bound: (0..n).map(at_bound).collect(),
+            at_bound,
             undetermined: undetermined.collect(),
             rough,
             sd,
@@ -969,32 +1134,128 @@ fn unscaled(unknown: &Unknown, x: f64, with: &Elementary) -> f64 {
     free.value(x, with)
 }
 
-fn reduced(columns: &[Vec<f64>], f: &[f64]) -> Triangle {
-    let mut triangle = Triangle::new(columns.len());
+/// Adds rows to a triangle.
+fn reduce(triangle: &mut Triangle, columns: &[Vec<f64>], f: &[f64]) {
     let mut row = vec![0.0; columns.len()];
     for (at, f) in f.iter().enumerate() {
         row.iter_mut().zip(columns).for_each(|(cell, column)| *cell = column[at]);
         triangle.add(&mut row, *f);
     }
-    triangle
+}
+
+fn slices(columns: &[Vec<f64>]) -> Vec<&[f64]> {
+    columns.iter().map(Vec::as_slice).collect()
+}
+
+/// How badly some rows fit, if the mean square of all rows of their item is this. Large residuals count little, so that a
+/// run that goes astray is bad and not infinitely bad.
+fn misfit(item: &Item, mean: f64, rows: &[f64], with: &Elementary) -> f64 {
+    let (floor, scale) = match item.sd {
+        Some(sd) => (1.0, 1.0 / (sd * sd)),
+        None => ((1e-6 * mean).max(f64::MIN_POSITIVE), 1.0),
+    };
+    rows.iter().map(|r| (with.log)(floor + scale * r * r)).sum()
+}
+
+/// Some rows of the Jacobian.
+struct Piece {
+    /// The item to which they belong; none of what is known beforehand.
+    item: Option<usize>,
+    /// Which rows of its residuals they come from.
+    range: Range<usize>,
+    /// Whitened residuals.
+    white: Vec<f64>,
+    /// Columns, for each size of the differences.
+    columns: Vec<Vec<f64>>,
+}
+
+impl Piece {
+    /// Its rows weighted, so that they have the gradient of the loss; none if all weights are 1.
+    fn weighted(&self, bounds: &[f64]) -> Option<(Vec<Vec<f64>>, Vec<f64>)> {
+        let bound = self.item.map(|k| bounds[k]).filter(|bound| bound.is_finite())?;
+        let weights: Vec<f64> = self.white.iter().map(|r| loss::root_weight(*r, bound)).collect();
+        let times = |rows: &Vec<f64>| rows.iter().zip(&weights).map(|(r, weight)| r * weight).collect::<Vec<f64>>();
+        Some((self.columns.iter().map(times).collect(), times(&self.white)))
+    }
+}
+
+/// Most numbers of a Jacobian that is kept in memory: 64 MB. A longer one is computed again where it is needed twice.
+const KEPT: usize = 8_000_000;
+
+/// What follows from a Jacobian.
+struct Linear {
+    triangle: Triangle,
+    /// Of each column the sum of squares, and that of the differences to those of the second size.
+    squares: Vec<f64>,
+    gaps: Vec<f64>,
+    /// Of each item.
+    correlations: Vec<Correlation>,
+    /// Sizes of the differences.
+    sizes: Vec<f64>,
+    /// The rows with the columns of the first size, unless they are too many; and how many numbers they are.
+    kept: Option<Vec<Piece>>,
+    numbers: usize,
+}
+
+impl Linear {
+    fn new(n: usize, stretches: &[Stretch], sizes: &[f64]) -> Linear {
+        Linear {
+            triangle: Triangle::new(n),
+            squares: vec![0.0; n],
+            gaps: vec![0.0; n],
+            correlations: stretches.iter().map(Correlation::new).collect(),
+            sizes: sizes.to_vec(),
+            kept: Some(Vec::new()),
+            numbers: 0,
+        }
+    }
+
+    fn add(&mut self, piece: &Piece) {
+        let n = self.squares.len();
+        let (columns, others) = piece.columns.split_at(n);
+        for (square, column) in self.squares.iter_mut().zip(columns) {
+            *square = column.iter().fold(*square, |sum, c| sum + c * c);
+        }
+        for (gap, (column, other)) in self.gaps.iter_mut().zip(columns.iter().zip(others)) {
+            *gap = column.iter().zip(other).fold(*gap, |sum, (a, b)| sum + (a - b) * (a - b));
+        }
+        reduce(&mut self.triangle, columns, &piece.white);
+        if let Some(k) = piece.item {
+            self.correlations[k].add(&slices(columns), &piece.white);
+        }
+        self.numbers += (n + 1) * piece.white.len();
+        if self.numbers > KEPT {
+            self.kept = None;
+        }
+        if let Some(kept) = &mut self.kept {
+            let Piece { item, range, white, .. } = piece;
+            kept.push(Piece { item: *item, range: range.clone(), white: white.clone(), columns: columns.to_vec() });
+        }
+    }
 }
 
 impl Objective for Search<'_> {
     fn cost(&mut self, x: &[f64]) -> Option<f64> {
         let residuals = self.residuals(x).ok()?;
-        let cost = 0.5 * self.loss(&self.white(x, &residuals), &residuals);
+        let cost = 0.5 * self.sums(x, &residuals).0;
         cost.is_finite().then_some(cost)
     }
 
     fn linearise(&mut self, x: &[f64]) -> Option<Triangle> {
-        let residuals = self.residuals(x).ok()?;
-        let mut columns = self.columns(x, 1.0)?;
-        self.size(&columns);
-        // Runs around `x` have replaced the last point.
-        self.last = Some((x.to_vec(), residuals.clone()));
-        let mut white = self.white(x, &residuals);
-        self.weighted(&mut columns, &mut white, &residuals);
-        Some(reduced(&columns, &white))
+        let n = x.len();
+        let new = || (Triangle::new(n), vec![0.0; n]);
+        let bounds = self.bounds();
+        let (triangle, squares) = self.jacobian(x, (&[1.0], false), &new, &mut |(triangle, squares), piece| {
+            for (square, column) in squares.iter_mut().zip(&piece.columns) {
+                *square = column.iter().fold(*square, |sum, c| sum + c * c);
+            }
+            match piece.weighted(&bounds) {
+                Some((columns, white)) => reduce(triangle, &columns, &white),
+                None => reduce(triangle, &piece.columns, &piece.white),
+            }
+        })?;
+        self.size(&squares);
+        Some(triangle)
     }
 }
 

@@ -18,7 +18,9 @@ pub mod ranking;
 pub mod information;
 pub mod cma_es;
 
-pub use estimate::{Answer, Combination, Estimator, Finer, Item, Minima, Question, Residuals, Rows, Trouble, Way, fit};
+pub use estimate::{
+    Answer, Combination, Estimator, Finer, Item, Minima, Question, Residuals, Rows, Runs, Tile, Trouble, Way, fit,
+};
 pub use journal::{Journal, Stage};
 pub use noise::Noise;
 pub use trust_region::{Ended, Limits};

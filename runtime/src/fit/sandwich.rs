@@ -7,6 +7,7 @@
 //! Sources: Newey, West, Econometrica 55 (1987); the number of rows by Andrews, Econometrica 59 (1991), eq. 6.2 and 6.4.
 
 use crate::fit::least_squares::Singular;
+use std::collections::VecDeque;
 use std::ops::Range;
 
 /// Most rows of a window, as a fraction of all.
@@ -33,59 +34,150 @@ pub struct Scatter {
 }
 
 /// The scatter of the gradient of a sum of squares. Rows in none of the stretches are independent, with variance 1.
-///
-/// The weights of pairs of rows fall linearly with their distance (Bartlett). So the sum over pairs is one over windows:
-/// each row enters and leaves the running sum of a window once, and the time does not depend on its width.
 pub fn scatter(columns: &[Vec<f64>], residuals: &[f64], stretches: &[Stretch]) -> Scatter {
-    let n = columns.len();
-    let (mut matrix, mut window) = (vec![0.0; n * n], 0.0_f64);
-    let mut add = |sum: &[f64], weight: f64| {
-        for (row, a) in matrix.chunks_mut(n).zip(sum) {
-            row.iter_mut().zip(sum).for_each(|(cell, b)| *cell += weight * a * b);
-        }
-    };
+    let mut correlations: Vec<Correlation> = stretches.iter().map(Correlation::new).collect();
+    for (correlation, Stretch { rows, .. }) in correlations.iter_mut().zip(stretches) {
+        let part: Vec<&[f64]> = columns.iter().map(|column| &column[rows.clone()]).collect();
+        correlation.add(&part, &residuals[rows.clone()]);
+    }
+    let mut windows = Windows::new(columns.len(), &correlations);
     let mut free = vec![true; residuals.len()];
-    let row = |at: usize| columns.iter().map(move |column| column[at] * residuals[at]);
-    for Stretch { rows, independent } in stretches {
+    for (k, Stretch { rows, .. }) in stretches.iter().enumerate() {
         free[rows.clone()].fill(false);
-        let width = if *independent { 1 } else { width(columns, residuals, rows) };
-        window = window.max(width as f64 / rows.len().max(1) as f64);
-        let mut sum = vec![0.0; n];
-        for at in rows.start..rows.end + width - 1 {
-            if at < rows.end {
-                sum.iter_mut().zip(row(at)).for_each(|(sum, u)| *sum += u);
-            }
-            if let Some(old) = at.checked_sub(width).filter(|old| *old >= rows.start) {
-                sum.iter_mut().zip(row(old)).for_each(|(sum, u)| *sum -= u);
-            }
-            add(&sum, 1.0 / width as f64);
-        }
+        let part: Vec<&[f64]> = columns.iter().map(|column| &column[rows.clone()]).collect();
+        windows.add(Some(k), &part, &residuals[rows.clone()]);
     }
     for at in (0..residuals.len()).filter(|at| free[*at]) {
-        add(&columns.iter().map(|column| column[at]).collect::<Vec<f64>>(), 1.0);
+        let part: Vec<&[f64]> = columns.iter().map(|column| &column[at..at + 1]).collect();
+        windows.add(None, &part, &residuals[at..at + 1]);
     }
-    Scatter { matrix, window }
+    windows.finish()
 }
 
-/// Rows of a window, from the correlation of each component of the gradient from row to row.
-fn width(columns: &[Vec<f64>], residuals: &[f64], rows: &Range<usize>) -> usize {
-    let (mut above, mut below) = (0.0, 0.0);
-    for column in columns {
-        let (mut product, mut square) = (0.0, 0.0);
-        for at in rows.start + 1..rows.end {
-            let (last, now) = (column[at - 1] * residuals[at - 1], column[at] * residuals[at]);
-            product += last * now;
-            square += last * last;
+/// The correlation of each component of the gradient from row to row, in one stretch.
+pub struct Correlation {
+    rows: usize,
+    independent: bool,
+    /// The last row of the gradient.
+    last: Option<Vec<f64>>,
+    /// For each component, the sums of its products with the last row and of the squares of that.
+    sums: Vec<(f64, f64)>,
+}
+
+impl Correlation {
+    /// Without rows yet.
+    pub fn new(stretch: &Stretch) -> Correlation {
+        let Stretch { rows, independent } = stretch;
+        Correlation { rows: rows.len(), independent: *independent, last: None, sums: Vec::new() }
+    }
+
+    /// Adds the next rows of the stretch.
+    pub fn add(&mut self, columns: &[&[f64]], residuals: &[f64]) {
+        self.sums.resize(columns.len(), (0.0, 0.0));
+        let Some(end) = residuals.len().checked_sub(1) else { return };
+        for (k, (column, (product, square))) in columns.iter().zip(&mut self.sums).enumerate() {
+            let mut last = self.last.as_ref().map(|last| last[k]);
+            for (slope, residual) in column.iter().zip(residuals) {
+                let now = slope * residual;
+                if let Some(last) = last {
+                    *product += last * now;
+                    *square += last * last;
+                }
+                last = Some(now);
+            }
         }
-        if square > 0.0 {
+        self.last = Some(columns.iter().map(|column| column[end] * residuals[end]).collect());
+    }
+
+    /// Rows of a window.
+    fn width(&self) -> usize {
+        if self.independent {
+            return 1;
+        }
+        let (mut above, mut below) = (0.0, 0.0);
+        for (product, square) in self.sums.iter().filter(|(_, square)| *square > 0.0) {
             let rho = (product / square).clamp(-MOST_CORRELATION, MOST_CORRELATION);
             let fourth = (1.0 - rho) * (1.0 - rho) * (1.0 - rho) * (1.0 - rho);
             above += 4.0 * rho * rho / (fourth * (1.0 - rho) * (1.0 - rho) * (1.0 + rho) * (1.0 + rho));
             below += 1.0 / fourth;
         }
+        let wanted = 1.1447 * cube_root(if below > 0.0 { above / below } else { 0.0 } * self.rows as f64);
+        (wanted.ceil().min(WIDEST * self.rows as f64) as usize).max(1)
     }
-    let wanted = 1.1447 * cube_root(if below > 0.0 { above / below } else { 0.0 } * rows.len() as f64);
-    (wanted.ceil().min(WIDEST * rows.len() as f64) as usize).max(1)
+}
+
+/// Sums over windows of rows.
+///
+/// The weights of pairs of rows fall linearly with their distance (Bartlett). So the sum over pairs is one over windows:
+/// each row enters and leaves the running sum of a window once, and the time does not depend on its width.
+pub struct Windows {
+    n: usize,
+    matrix: Vec<f64>,
+    window: f64,
+    stretches: Vec<Window>,
+}
+
+/// A window that moves over a stretch.
+struct Window {
+    /// Rows of the stretch that are still to come.
+    left: usize,
+    width: usize,
+    sum: Vec<f64>,
+    /// The rows in the window.
+    inside: VecDeque<f64>,
+}
+
+impl Windows {
+    /// Without rows yet, for a gradient of n components, in stretches of these correlations.
+    pub fn new(n: usize, correlations: &[Correlation]) -> Windows {
+        let one = |correlation: &Correlation| {
+            let width = correlation.width();
+            Window { left: correlation.rows, width, sum: vec![0.0; n], inside: VecDeque::new() }
+        };
+        let stretches: Vec<Window> = correlations.iter().map(one).collect();
+        let part = |window: &Window| window.width as f64 / window.left.max(1) as f64;
+        let window = stretches.iter().map(part).fold(0.0, f64::max);
+        Windows { n, matrix: vec![0.0; n * n], window, stretches }
+    }
+
+    /// Adds the next rows of a stretch, or rows of none.
+    pub fn add(&mut self, stretch: Option<usize>, columns: &[&[f64]], residuals: &[f64]) {
+        let (n, matrix) = (self.n, &mut self.matrix);
+        let mut add = |sum: &[f64], weight: f64| {
+            for (row, a) in matrix.chunks_mut(n).zip(sum) {
+                row.iter_mut().zip(sum).for_each(|(cell, b)| *cell += weight * a * b);
+            }
+        };
+        let Some(Window { left, width, sum, inside }) = stretch.map(|stretch| &mut self.stretches[stretch]) else {
+            for at in 0..residuals.len() {
+                add(&columns.iter().map(|column| column[at]).collect::<Vec<f64>>(), 1.0);
+            }
+            return;
+        };
+        let (weight, full) = (1.0 / *width as f64, n * *width);
+        for (at, residual) in residuals.iter().enumerate() {
+            let row = columns.iter().map(|column| column[at] * residual);
+            sum.iter_mut().zip(row.clone()).for_each(|(sum, u)| *sum += u);
+            if inside.len() == full {
+                sum.iter_mut().zip(inside.drain(..n)).for_each(|(sum, u)| *sum -= u);
+            }
+            inside.extend(row);
+            add(sum, weight);
+        }
+        *left -= residuals.len();
+        // At the end the window moves out of the stretch.
+        if *left == 0 {
+            while inside.len() > n {
+                sum.iter_mut().zip(inside.drain(..n)).for_each(|(sum, u)| *sum -= u);
+                add(sum, weight);
+            }
+        }
+    }
+
+    /// The scatter of all rows.
+    pub fn finish(self) -> Scatter {
+        Scatter { matrix: self.matrix, window: self.window }
+    }
 }
 
 /// The cube root by Newton's method: elementary functions of the platform differ between machines.
@@ -150,7 +242,10 @@ mod tests {
                 .collect();
             let stretch = Stretch { rows: 2..rows, independent: false };
             let found = scatter(&columns, &residuals, std::slice::from_ref(&stretch));
-            let width = width(&columns, &residuals, &stretch.rows) as f64;
+            let mut correlation = Correlation::new(&stretch);
+            let part: Vec<&[f64]> = columns.iter().map(|column| &column[stretch.rows.clone()]).collect();
+            correlation.add(&part, &residuals[stretch.rows.clone()]);
+            let width = correlation.width() as f64;
             for i in 0..3 {
                 for j in 0..3 {
                     let mut expected = 0.0;

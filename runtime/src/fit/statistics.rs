@@ -5,6 +5,7 @@
 
 use crate::fit::quantiles::chi_square_tail;
 use crate::fit::unknowns::Elementary;
+use std::borrow::Cow;
 use std::ops::Range;
 
 /// Most classes into which the values of a column are divided, and fewest rows of a class.
@@ -34,44 +35,41 @@ pub struct Dependence {
 /// The column that explains most of the variance of residuals, if it is significant: the rows are divided into classes by
 /// the value of the column, and under independence the sum of squares between the classes is distributed as χ².
 ///
-/// `white`: the whitened residuals; `kept`: their rows. Source: Davidson, MacKinnon, Econometric Theory and Methods,
-/// sec. 5.4 (the Wald test of dummies).
-pub fn dependence(
-    residuals: &[f64],
-    (kept, white): (&[usize], &[f64]),
-    columns: &[&[f64]],
+/// `white`: the whitened residuals by row; NaN in rows that the filter uses up. `columns`: their number, and one of them;
+/// they need not be in memory together. Source: Davidson, MacKinnon, Econometric Theory and Methods, sec. 5.4 (the Wald
+/// test of dummies).
+pub fn dependence<'c>(
+    (residuals, white): (&[f64], &[f64]),
+    (count, column): (usize, &dyn Fn(usize) -> Cow<'c, [f64]>),
     with: &Elementary,
 ) -> Option<Dependence> {
-    let mut place = vec![None; residuals.len()];
-    kept.iter().enumerate().for_each(|(at, row)| place[*row] = Some(at));
-    let one = |(k, column): (usize, &&[f64])| {
-        let classes = classes(column);
+    let one = |k: usize| {
+        let column = column(k);
+        let classes = Classes::of(&column);
         if classes.len() < 2 {
             return None;
         }
-        let of_white: Vec<Vec<usize>> =
-            classes.iter().map(|class| class.iter().filter_map(|row| place[*row]).collect()).collect();
-        let (between, all) = between(white, &of_white);
-        let n = white.len() as f64;
+        let (between, all, n) = between(white, &classes);
         let degrees = classes.len() as f64 - 1.0;
         let probability = chi_square_tail(n * between / all, degrees, with);
         let share = {
-            let (between, all) = self::between(residuals, &classes);
+            let (between, all, _) = self::between(residuals, &classes);
             between / all
         };
-        let is_significant = probability < SIGNIFICANT / columns.len() as f64;
+        let is_significant = probability < SIGNIFICANT / count as f64;
         if !(is_significant && share > LEAST_SHARE || share > MOST) {
             return None;
         }
-        let weight = |class: &Vec<usize>| {
-            let sum: f64 = class.iter().map(|row| residuals[*row]).sum();
+        let weight = |class: &[u32]| {
+            let sum: f64 = class.iter().map(|row| residuals[*row as usize]).sum();
             sum * sum / class.len() as f64
         };
-        let worst = (0..classes.len()).max_by(|a, b| weight(&classes[*a]).total_cmp(&weight(&classes[*b])))?;
-        let (low, high) = (column[classes[worst][0]], column[*classes[worst].last()?]);
+        let worst = (0..classes.len()).max_by(|a, b| weight(classes.get(*a)).total_cmp(&weight(classes.get(*b))))?;
+        let class = classes.get(worst);
+        let (low, high) = (column[class[0] as usize], column[*class.last()? as usize]);
         Some(Dependence { column: k, share, class: (low, high), edge: (worst == 0, worst + 1 == classes.len()) })
     };
-    let found = columns.iter().enumerate().filter_map(one);
+    let found = (0..count).filter_map(one);
     found.max_by(|a, b| a.share.total_cmp(&b.share))
 }
 
@@ -80,32 +78,39 @@ const LARGER: f64 = 3.0;
 
 /// The column and the class of its values in which more than half of the squared error lies, where the rows of the class
 /// are no few outliers: the model lacks something there that has no sign. Its `share` is that of the squared error.
-pub fn concentration(residuals: &[f64], columns: &[&[f64]]) -> Option<Dependence> {
+pub fn concentration<'c>(
+    residuals: &[f64],
+    (count, column): (usize, &dyn Fn(usize) -> Cow<'c, [f64]>),
+) -> Option<Dependence> {
     let all: f64 = residuals.iter().map(|r| r * r).sum();
-    let median = |rows: &mut dyn Iterator<Item = usize>| {
-        let mut sizes: Vec<f64> = rows.map(|row| residuals[row].abs()).collect();
-        sizes.sort_by(f64::total_cmp);
-        sizes.get(sizes.len() / 2).copied().unwrap_or(0.0)
+    let median = |rows: &mut dyn Iterator<Item = &u32>| {
+        let mut sizes: Vec<f64> = rows.map(|row| residuals[*row as usize].abs()).collect();
+        let middle = sizes.len() / 2;
+        if sizes.is_empty() { 0.0 } else { *sizes.select_nth_unstable_by(middle, f64::total_cmp).1 }
     };
-    let of = |(k, column): (usize, &&[f64])| {
-        let classes = classes(column);
-        let one = |(at, class): (usize, &Vec<usize>)| {
-            let share = class.iter().map(|row| residuals[*row] * residuals[*row]).sum::<f64>() / all;
-            let others = classes.iter().enumerate().filter(|(other, _)| *other != at).flat_map(|(_, class)| class);
-            let is_larger = || median(&mut class.iter().copied()) > LARGER * median(&mut others.copied());
-            let found = share > MOST && 2 * class.len() < residuals.len() && is_larger();
+    let of = |k: usize| {
+        let column = column(k);
+        let classes = Classes::of(&column);
+        let value = |row: u32| column[row as usize];
+        let one = |at: usize| {
+            let class = classes.get(at);
+            let square = |row: &u32| residuals[*row as usize] * residuals[*row as usize];
+            let share = class.iter().map(square).sum::<f64>() / all;
+            let mut others = (0..classes.len()).filter(|other| *other != at).flat_map(|other| classes.get(other));
+            let is_larger = |others| median(&mut class.iter()) > LARGER * median(others);
+            let found = share > MOST && 2 * class.len() < residuals.len() && is_larger(&mut others);
             // Rows with the value that most of the class have are meant.
-            let middle = column[class[class.len() / 2]];
-            let equal = class.iter().filter(|row| column[**row] == middle).count();
+            let middle = value(class[class.len() / 2]);
+            let equal = class.iter().filter(|row| value(**row) == middle).count();
             let (class, edge) = match 2 * equal > class.len() {
                 true => ((middle, middle), (false, false)),
-                false => ((column[class[0]], column[*class.last()?]), (at == 0, at + 1 == classes.len())),
+                false => ((value(class[0]), value(*class.last()?)), (at == 0, at + 1 == classes.len())),
             };
             found.then_some(Dependence { column: k, share, class, edge })
         };
-        classes.iter().enumerate().filter_map(one).next()
+        (0..classes.len()).filter_map(one).next()
     };
-    columns.iter().enumerate().filter_map(of).max_by(|a, b| a.share.total_cmp(&b.share))
+    (0..count).filter_map(of).max_by(|a, b| a.share.total_cmp(&b.share))
 }
 
 /// P(χ² > x) with this number of degrees of freedom.
@@ -114,37 +119,58 @@ pub fn tail(x: f64, degrees: f64, with: &Elementary) -> f64 {
 }
 
 /// The rows in classes of rising values of a column. Equal values are in one class.
-fn classes(column: &[f64]) -> Vec<Vec<usize>> {
-    let n = column.len();
-    let count = (n / LEAST_OF_CLASS).min(CLASSES);
-    let mut order: Vec<usize> = (0..n).collect();
-    order.sort_by(|a, b| column[*a].total_cmp(&column[*b]));
-    let mut all: Vec<Vec<usize>> = Vec::new();
-    let mut begin = 0;
-    for k in 1..=count {
-        let mut end = k * n / count;
-        while end < n && end > 0 && column[order[end]] == column[order[end - 1]] {
-            end += 1;
-        }
-        if end > begin {
-            all.push(order[begin..end].to_vec());
-            begin = end;
-        }
-    }
-    all
+struct Classes {
+    /// The rows in the order of their values.
+    order: Vec<u32>,
+    /// Where each class ends in it.
+    ends: Vec<usize>,
 }
 
-/// The mean square between classes, and that of all rows, about their mean.
-fn between(rows: &[f64], classes: &[Vec<usize>]) -> (f64, f64) {
-    let n = rows.len() as f64;
-    let mean = rows.iter().sum::<f64>() / n;
-    let all = rows.iter().map(|r| (r - mean) * (r - mean)).sum::<f64>() / n;
-    let of = |class: &Vec<usize>| {
-        let count = class.len().max(1) as f64;
-        let off = class.iter().map(|row| rows[*row]).sum::<f64>() / count - mean;
-        if class.is_empty() { 0.0 } else { count * off * off }
+impl Classes {
+    fn of(column: &[f64]) -> Classes {
+        let n = column.len();
+        let count = (n / LEAST_OF_CLASS).min(CLASSES);
+        let mut order: Vec<u32> = (0..u32::try_from(n).expect("fewer rows than 2^32")).collect();
+        order.sort_by(|a, b| column[*a as usize].total_cmp(&column[*b as usize]));
+        let value = |at: usize| column[order[at] as usize];
+        let (mut ends, mut begin) = (Vec::new(), 0);
+        for k in 1..=count {
+            let mut end = k * n / count;
+            while end < n && end > 0 && value(end) == value(end - 1) {
+                end += 1;
+            }
+            if end > begin {
+                ends.push(end);
+                begin = end;
+            }
+        }
+        Classes { order, ends }
+    }
+
+    fn len(&self) -> usize {
+        self.ends.len()
+    }
+
+    fn get(&self, class: usize) -> &[u32] {
+        let begin = if class == 0 { 0 } else { self.ends[class - 1] };
+        &self.order[begin..self.ends[class]]
+    }
+}
+
+/// The mean square between classes, and that of all rows, about their mean; and the number of rows that are not NaN, which
+/// alone count.
+fn between(rows: &[f64], classes: &Classes) -> (f64, f64, f64) {
+    let known = || rows.iter().filter(|r| !r.is_nan());
+    let n = known().count() as f64;
+    let mean = known().sum::<f64>() / n;
+    let all = known().map(|r| (r - mean) * (r - mean)).sum::<f64>() / n;
+    let of = |class: usize| {
+        let known = || classes.get(class).iter().map(|row| rows[*row as usize]).filter(|r| !r.is_nan());
+        let count = known().count();
+        let off = known().sum::<f64>() / count.max(1) as f64 - mean;
+        if count == 0 { 0.0 } else { count as f64 * off * off }
     };
-    (classes.iter().map(of).sum::<f64>() / n, all.max(f64::MIN_POSITIVE))
+    ((0..classes.len()).map(of).sum::<f64>() / n, all.max(f64::MIN_POSITIVE), n)
 }
 
 /// Whitened residuals beyond this many standard deviations are outliers.
@@ -162,18 +188,19 @@ pub struct Outliers {
 }
 
 /// Rows that hold much of the error; none if there are no such. The standard deviation is that of the median, which
-/// outliers do not move. `white`: the whitened residuals; `kept`: their rows.
-pub fn outliers(residuals: &[f64], (kept, white): (&[usize], &[f64])) -> Option<Outliers> {
+/// outliers do not move. `white`: the whitened residuals by row; NaN in rows that the filter uses up.
+pub fn outliers(residuals: &[f64], white: &[f64]) -> Option<Outliers> {
     let robust = |rows: &[f64]| {
-        let mut sizes: Vec<f64> = rows.iter().map(|r| r.abs()).collect();
-        sizes.sort_by(f64::total_cmp);
+        let mut sizes: Vec<f64> = rows.iter().map(|r| r.abs()).filter(|r| !r.is_nan()).collect();
+        let middle = sizes.len() / 2;
+        let median = if sizes.is_empty() { 0.0 } else { *sizes.select_nth_unstable_by(middle, f64::total_cmp).1 };
         // Half of a normal variable lies within 0.6745 standard deviations.
-        sizes.get(sizes.len() / 2).copied().unwrap_or(0.0) / 0.674_489_75
+        median / 0.674_489_75
     };
     let (sd, unfiltered) = (robust(white), robust(residuals));
     // Whitening spreads an outlier over the rows after it.
-    let is_far = |k: &usize| white[*k].abs() > FAR * sd && residuals[kept[*k]].abs() > 0.5 * FAR * unfiltered;
-    let rows: Vec<usize> = (0..white.len()).filter(|k| sd > 0.0 && is_far(k)).map(|k| kept[k]).collect();
+    let is_far = |k: &usize| white[*k].abs() > FAR * sd && residuals[*k].abs() > 0.5 * FAR * unfiltered;
+    let rows: Vec<usize> = (0..white.len()).filter(|k| sd > 0.0 && is_far(k)).collect();
     let n = residuals.len();
     let all: f64 = residuals.iter().map(|r| r * r).sum();
     let tenths = (0..TENTHS).map(|k| k * n / TENTHS..(k + 1) * n / TENTHS);
@@ -243,14 +270,14 @@ mod tests {
             let n = 400 + chance.below(2000) as usize;
             let columns: Vec<Vec<f64>> = (0..3).map(|_| (0..n).map(|_| chance.between(-1.0, 1.0)).collect()).collect();
             let noise: Vec<f64> = (0..n).map(|_| normal(&mut chance)).collect();
-            let slices: Vec<&[f64]> = columns.iter().map(Vec::as_slice).collect();
-            let all: Vec<usize> = (0..n).collect();
-            false_alarms += usize::from(dependence(&noise, (&all, &noise), &slices, &PLATFORM).is_some());
+            let column = |k: usize| Cow::from(&columns[k]);
+            let found = dependence((&noise, &noise), (columns.len(), &column), &PLATFORM);
+            false_alarms += usize::from(found.is_some());
             let which = seed as usize % 3;
             let strong: Vec<f64> =
                 (0..n).map(|k| noise[k] + if columns[which][k] < -0.8 { 3.0 } else { 0.0 }).collect();
-            let found =
-                dependence(&strong, (&all, &strong), &slices, &PLATFORM).unwrap_or_else(|| panic!("seed {seed}: none"));
+            let found = dependence((&strong, &strong), (columns.len(), &column), &PLATFORM);
+            let found = found.unwrap_or_else(|| panic!("seed {seed}: none"));
             assert_eq!((found.column, found.edge), (which, (true, false)), "seed {seed}: {found:?}");
             // Variance of the step: 9 · 0.1 · 0.9 = 0.81, of 1.81. A class with rows of both sides explains less.
             assert!((0.2..0.57).contains(&found.share) && found.class.1 < -0.7, "seed {seed}: {found:?}");
@@ -268,24 +295,24 @@ mod tests {
                 (0..1000).map(|k| if k % 4 == 0 { 0.0 } else { chance.between(-1.0, 1.0) }).collect();
             let noise: Vec<f64> = (0..1000).map(|_| normal(&mut chance)).collect();
             let rest: Vec<f64> = (0..1000).map(|k| if k % 4 == 0 { 20.0 } else { 1.0 } * noise[k]).collect();
-            let found = concentration(&rest, &[&column]).unwrap_or_else(|| panic!("seed {seed}: none"));
+            let found =
+                concentration(&rest, (1, &|_| Cow::from(&column))).unwrap_or_else(|| panic!("seed {seed}: none"));
             let (low, high) = found.class;
             assert!(low > -0.03 && high < 0.03 && found.share > 0.9, "seed {seed}: {found:?}");
-            assert_eq!(concentration(&noise, &[&column]), None, "seed {seed}");
+            assert_eq!(concentration(&noise, (1, &|_| Cow::from(&column))), None, "seed {seed}");
             let wild: Vec<f64> = (0..1000).map(|k| if k < 3 { 100.0 } else { noise[k] }).collect();
             let rising: Vec<f64> = (0..1000).map(f64::from).collect();
-            assert_eq!(concentration(&wild, &[&rising]), None, "seed {seed}");
+            assert_eq!(concentration(&wild, (1, &|_| Cow::from(&rising))), None, "seed {seed}");
         }
     }
 
     #[test]
     fn columns_that_do_not_vary_divide_nothing() {
         let rows: Vec<f64> = (0..200).map(f64::from).collect();
-        let all: Vec<usize> = (0..200).collect();
-        assert_eq!(dependence(&rows, (&all, &rows), &[&[1.0; 200]], &PLATFORM), None);
+        assert_eq!(dependence((&rows, &rows), (1, &|_| Cow::from(&[1.0; 200])), &PLATFORM), None);
         let steps: Vec<f64> = (0..200).map(|k| f64::from(k / 150)).collect();
-        let all = classes(&steps);
-        assert_eq!(all.iter().map(Vec::len).collect::<Vec<_>>(), [150, 50]);
+        let classes = Classes::of(&steps);
+        assert_eq!((0..classes.len()).map(|k| classes.get(k).len()).collect::<Vec<_>>(), [150, 50]);
     }
 
     /// A burst is found where it is; a normal recording has none.
@@ -294,12 +321,12 @@ mod tests {
         for seed in 0..100 {
             let mut chance = Chance(seed);
             let mut rows: Vec<f64> = (0..2000).map(|_| normal(&mut chance)).collect();
-            let kept: Vec<usize> = (3..rows.len()).collect();
-            assert_eq!(outliers(&rows, (&kept, &rows[3..])), None, "seed {seed}");
+            let white = |rows: &[f64]| [&[f64::NAN; 3], &rows[3..]].concat();
+            assert_eq!(outliers(&rows, &white(&rows)), None, "seed {seed}");
             let at = 10 + chance.below(1900) as usize;
             let length = 1 + chance.below(60) as usize;
             rows[at..at + length].iter_mut().for_each(|r| *r = 40.0 * if chance.fraction() < 0.5 { -1.0 } else { 1.0 });
-            let found = outliers(&rows, (&kept, &rows[3..])).unwrap_or_else(|| panic!("seed {seed}: none"));
+            let found = outliers(&rows, &white(&rows)).unwrap_or_else(|| panic!("seed {seed}: none"));
             assert_eq!(found.rows, (at..at + length).collect::<Vec<_>>(), "seed {seed}");
         }
     }

@@ -1,6 +1,6 @@
 //! A run with fixed steps, each a call of the model's compiled step function.
 
-use crate::run::observe::{Observer, check_finite, check_status};
+use crate::run::observe::{Observer, Probe, check_finite, check_status};
 use crate::run::outcome::{Cause, Continue, Stop};
 use crate::run::stepper::{Rest, Stepper};
 use crate::stretch::{Stretch, multiples};
@@ -218,6 +218,10 @@ impl Stepper for Fixed {
 
     fn instance(&mut self) -> &mut Instance {
         &mut self.rest.instance
+    }
+
+    fn probe(&mut self) -> &mut Probe {
+        &mut self.rest.observer.probe
     }
 
     fn fetch(&mut self, done: u64, status: u64, from: &dyn Fn(Range<usize>, &mut [f64])) {

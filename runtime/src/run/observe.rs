@@ -10,6 +10,7 @@ use crate::stretch::Stretch;
 use abi::description::Kind;
 use abi::plan::Experiment;
 use abi::{Instance, Slot};
+use std::sync::Arc;
 
 /// All observers of a run.
 pub(crate) struct Observer {
@@ -23,23 +24,23 @@ pub(crate) struct Observer {
 
 /// Records the values of some slots at given instants, in ascending order.
 pub(crate) struct Probe {
-    instants: Vec<f64>,
+    instants: Arc<[f64]>,
     slots: Vec<Slot>,
     /// Number of instants passed.
     passed: usize,
-    /// Row-major, a row for each of these.
+    /// Row-major, a row for each of these that has not been [drawn](Probe::draw).
     values: Vec<f64>,
 }
 
 impl Default for Probe {
     fn default() -> Probe {
-        Probe::new(&[], &[])
+        Probe::new(&Arc::from([]), &[])
     }
 }
 
 impl Probe {
-    pub(crate) fn new(instants: &[f64], slots: &[Slot]) -> Probe {
-        Probe { instants: instants.to_vec(), slots: slots.to_vec(), passed: 0, values: Vec::new() }
+    pub(crate) fn new(instants: &Arc<[f64]>, slots: &[Slot]) -> Probe {
+        Probe { instants: instants.clone(), slots: slots.to_vec(), passed: 0, values: Vec::new() }
     }
 
     /// The slots to record.
@@ -67,6 +68,17 @@ impl Probe {
                 self.passed += 1;
             }
         }
+    }
+
+    /// Number of rows that have not been drawn.
+    pub(crate) fn rows(&self) -> usize {
+        self.values.len() / self.slots.len().max(1)
+    }
+
+    /// Takes out the first rows, at most so many.
+    pub(crate) fn draw(&mut self, rows: usize) -> Vec<f64> {
+        let rest = self.values.split_off((rows * self.slots.len()).min(self.values.len()));
+        std::mem::replace(&mut self.values, rest)
     }
 
     pub(crate) fn values(self) -> Vec<f64> {

@@ -3,14 +3,14 @@
 //! In: an instance, a plan and an observer. Out: a [`Stepper`], and at its end a [`Rest`]. A run depends only on what
 //! the calls leave in its own block, so results do not depend on how calls were batched.
 
-use crate::run::observe::Observer;
+use crate::run::observe::{Observer, Probe};
 use crate::run::outcome::{Continue, Stop, Work};
 use crate::stretch::copy_column;
 use abi::{Function, Instance, Slot};
 use std::ops::Range;
 
 /// A run in progress.
-pub(crate) trait Stepper {
+pub(crate) trait Stepper: Send {
     /// The function that advances it.
     fn function(&self) -> Function;
 
@@ -35,6 +35,9 @@ pub(crate) trait Stepper {
 
     /// The instance whose block the calls work on.
     fn instance(&mut self) -> &mut Instance;
+
+    /// What it records at given instants.
+    fn probe(&mut self) -> &mut Probe;
 
     /// If the calls were made on another block: copies from there the slots that `take` reads.
     fn fetch(&mut self, done: u64, status: u64, from: &dyn Fn(Range<usize>, &mut [f64]));
@@ -67,16 +70,26 @@ impl Rest {
 
 /// Runs it alone to its end, or to the reason to stop.
 pub(crate) fn alone(course: &mut dyn Stepper, watch: &mut dyn FnMut(f64) -> Continue) -> Result<(), Stop> {
+    until(course, &mut |_| false, watch).map(|_| ())
+}
+
+/// Runs it alone until it has recorded enough, to its end, or to the reason to stop. Returns whether it has ended.
+pub(crate) fn until(
+    course: &mut dyn Stepper,
+    has_enough: &mut dyn FnMut(&mut Probe) -> bool,
+    watch: &mut dyn FnMut(f64) -> Continue,
+) -> Result<bool, Stop> {
     let function = course.function();
     let mut rows = Vec::new();
-    while let Some(count) = course.next(watch)? {
+    while !has_enough(course.probe()) {
+        let Some(count) = course.next(watch)? else { return Ok(true) };
         let (done, status) = match in_series(course, &mut rows)? {
             Some(made) => made,
             None => (count, course.instance().call_up_to(function, count)),
         };
         course.take(done, status)?;
     }
-    Ok(())
+    Ok(false)
 }
 
 /// Makes the calls of a series in one, if there is code that records the slots, and shows all but the last. Returns their

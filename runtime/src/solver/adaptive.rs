@@ -16,7 +16,7 @@ use super::points::Points;
 use super::rosenbrock::Rosenbrock;
 use super::step::{Step, System, copy};
 use super::surfaces::{Crossing, Surfaces};
-use crate::run::observe::{Observer, check_finite, check_status};
+use crate::run::observe::{Observer, Probe, check_finite, check_status};
 use crate::run::outcome::{Cause, Chatter, Continue, Stop, Work};
 use crate::run::stepper::{Rest, Stepper};
 use abi::description::{Guard, Kind};
@@ -1006,6 +1006,10 @@ impl Stepper for Adaptive {
 
     fn instance(&mut self) -> &mut Instance {
         &mut self.system.instance
+    }
+
+    fn probe(&mut self) -> &mut Probe {
+        self.points.probe_mut()
     }
 
     fn fetch(&mut self, _: u64, status: u64, from: &dyn Fn(Range<usize>, &mut [f64])) {

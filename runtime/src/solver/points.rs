@@ -8,7 +8,7 @@
 
 use super::step::{Step, System};
 use crate::run::measure::{Demand, Wants};
-use crate::run::observe::{Observer, check_status};
+use crate::run::observe::{Observer, Probe, check_status};
 use crate::run::outcome::Stop;
 use abi::plan::Experiment;
 use abi::{Function, Instance};
@@ -184,6 +184,11 @@ impl Points {
     /// Whether every step is shown.
     pub(crate) fn are_shown(&self) -> bool {
         !self.slots.is_empty()
+    }
+
+    /// What is recorded at given instants.
+    pub(crate) fn probe_mut(&mut self) -> &mut Probe {
+        &mut self.observer.probe
     }
 
     /// The next instant at which a value is requested, in s; infinite if there is none.

@@ -4,13 +4,14 @@
 //! In: runs and their answer. Out: values of pieces, profiles, and what stands out in the residuals. Knows nothing of
 //! words.
 
-use super::search::{Found, Part, Runs, Settings, estimate};
+use super::search::{Found, Part, Runs, Settings, Stepped, estimate};
 use crate::compile::ElementaryFunction;
 use abi::unit::Unit;
 use runtime::fit::loss::loss;
 use runtime::fit::ranking;
 use runtime::fit::statistics::{self, Dependence, Outliers};
-use runtime::fit::{Answer, Elementary, Item, Limits, Noise, Residuals, Trouble, Unknown, Way};
+use runtime::fit::{Answer, Elementary, Item, Limits, Noise, Residuals, Tile, Trouble, Unknown, Way};
+use std::borrow::Cow;
 
 /// Components of a combination that count, as a fraction of the largest.
 pub const NAMED: f64 = 0.2;
@@ -35,8 +36,35 @@ const FALSE_DRIFT: f64 = 1e-3;
 /// Values and standard deviations in one piece of the recordings; none where the piece does not determine them.
 pub type Piece = Vec<Option<(f64, f64)>>;
 
-/// Runs a model with values of all unknowns.
-type Whole<'a> = dyn FnMut(&[Vec<f64>]) -> Vec<Result<Residuals, String>> + 'a;
+/// Runs with some of the unknowns, the others as in `base`.
+struct Restricted<'r> {
+    model: Stepped<'r>,
+    base: &'r [f64],
+    free: &'r [usize],
+}
+
+impl Restricted<'_> {
+    fn expanded(&self, points: &[Vec<f64>]) -> Vec<Vec<f64>> {
+        let one = |point: &Vec<f64>| {
+            let mut values = self.base.to_vec();
+            self.free.iter().zip(point).for_each(|(k, value)| values[*k] = *value);
+            values
+        };
+        points.iter().map(one).collect()
+    }
+}
+
+impl runtime::fit::Runs for Restricted<'_> {
+    fn run(&mut self, _: Way, points: &[Vec<f64>]) -> Vec<Result<Residuals, String>> {
+        let points = self.expanded(points);
+        self.model.run(Way::Whole, &points)
+    }
+
+    fn pass(&mut self, _: Way, points: &[Vec<f64>], each: &mut dyn FnMut(&Tile)) -> Vec<Result<(), String>> {
+        let points = self.expanded(points);
+        self.model.pass(Way::Whole, &points, each)
+    }
+}
 
 /// Runs with some of the unknowns, the others as in `base`, which bound those that they must not cross.
 fn restricted(
@@ -44,7 +72,7 @@ fn restricted(
     base: &[f64],
     free: &[usize],
     settings: Settings,
-    (items, run): (&[Item], &mut Whole),
+    (items, model): (&[Item], Stepped),
 ) -> Result<Answer, Trouble> {
     let all = runs.asked(base);
     let place = |k: usize| free.iter().position(|other| *other == k);
@@ -62,17 +90,8 @@ fn restricted(
     };
     let unknowns: Option<Vec<Unknown>> = free.iter().map(one).collect();
     let unknowns = unknowns.ok_or_else(|| Trouble::NoStart("the others leave no room".into()))?;
-    let mut whole = |_: Way, points: &[Vec<f64>]| {
-        let expanded = points.iter().map(|point| {
-            let mut values = base.to_vec();
-            for (k, value) in free.iter().zip(point) {
-                values[*k] = *value;
-            }
-            values
-        });
-        run(&expanded.collect::<Vec<_>>())
-    };
-    estimate(runs, &unknowns, items, Settings { starts: Some(1), ..settings }, (&mut whole, None))
+    let mut run = Restricted { model, base, free };
+    estimate(runs, &unknowns, items, Settings { starts: Some(1), ..settings }, (&mut run, None))
 }
 
 /// Whether an unknown is part of a combination that the data do not determine.
@@ -99,10 +118,10 @@ pub fn pieces(runs: &Runs, (answer, steps, _): &Found, settings: Settings, count
             let rows = part.instants.len();
             (piece * rows / count..(piece + 1) * rows / count).collect()
         };
-        let items = runs.compared(&rows);
-        let mut run = |points: &[Vec<f64>]| runs.residuals_at(points, steps, &rows);
+        let items = runs.compared(&|part| Some(rows(part)));
+        let run = runs.with(steps).at(&rows);
         while !free.is_empty() {
-            match restricted(runs, &answer.values, &free, settings, (&items, &mut run)) {
+            match restricted(runs, &answer.values, &free, settings, (&items, run.clone())) {
                 Ok(found) => {
                     let mut values: Piece = vec![None; n];
                     for (at, k) in free.iter().enumerate() {
@@ -280,9 +299,9 @@ fn rise(
     if free.is_empty() {
         return alone(runs, answer, base, steps).unwrap_or(f64::INFINITY);
     }
-    let mut run = |points: &[Vec<f64>]| runs.residuals(Way::Whole, points, steps);
     let items = runs.compared_whole();
-    let Ok(found) = restricted(runs, base, free, settings, (&items, &mut run)) else { return f64::INFINITY };
+    let found = restricted(runs, base, free, settings, (&items, runs.with(steps)));
+    let Ok(found) = found else { return f64::INFINITY };
     for (at, other) in free.iter().enumerate() {
         base[*other] = found.values[at];
     }
@@ -293,7 +312,7 @@ fn rise(
 
 /// The misfit with these values, under the noise model of the answer.
 fn alone(runs: &Runs, answer: &Answer, values: &[f64], steps: &[f64]) -> Option<f64> {
-    let residuals = runs.residuals(Way::Whole, &[values.to_vec()], steps).remove(0).ok()?;
+    let residuals = runs.residuals(Way::Whole, values, steps).ok()?;
     let scaled = |(noise, rows): (&Noise, &Vec<f64>)| {
         let whitened = noise.whitened(rows);
         let part = whitened.iter().map(|r| r * r).sum::<f64>() / whitened.len().max(1) as f64;
@@ -334,15 +353,15 @@ pub fn judge(runs: &Runs, (answer, steps, _): &Found, settings: Settings) -> Vec
         let mut values: Vec<f64> = judged.unknowns.iter().map(value).collect();
         let own: Vec<usize> = (0..values.len()).filter(|k| judged.unknowns[*k].of.is_some()).collect();
         if !own.is_empty() {
-            let mut run = |points: &[Vec<f64>]| judged.residuals(Way::Whole, points, &steps);
-            let found = restricted(judged, &values, &own, settings, (&judged.compared_whole(), &mut run));
+            let whole = (&judged.compared_whole()[..], judged.with(&steps));
+            let found = restricted(judged, &values, &own, settings, whole);
             for (at, k) in own.iter().enumerate() {
                 if let Ok(found) = &found {
                     values[*k] = found.values[at];
                 }
             }
         }
-        let residuals = judged.residuals(Way::Whole, &[values.clone()], &steps).remove(0)?;
+        let residuals = judged.residuals(Way::Whole, &values, &steps)?;
         let own = own.iter().map(|k| (judged.unknowns[*k].label.clone(), values[*k], judged.unknowns[*k].unit.clone()));
         Ok(Judged { label: part.asks.label.clone(), own: own.collect(), residuals })
     };
@@ -364,10 +383,10 @@ pub fn held_out(runs: &Runs, found: &Found, settings: Settings) -> Option<Residu
     let mut out: Residuals = answer.residuals.iter().map(|rows| vec![0.0; rows.len()]).collect();
     let free: Vec<usize> = (0..runs.unknowns.len()).collect();
     for half in [0, 1] {
-        let items = runs.compared(&|part| seen(part, half));
-        let mut run = |points: &[Vec<f64>]| runs.residuals_at(points, steps, &|part| seen(part, half));
-        let values = restricted(runs, &answer.values, &free, settings.like(answer), (&items, &mut run)).ok()?.values;
-        let all = runs.residuals(Way::Whole, &[values], steps).remove(0).ok()?;
+        let items = runs.compared(&|part| Some(seen(part, half)));
+        let run = runs.with(steps).at(&|part| seen(part, half));
+        let values = restricted(runs, &answer.values, &free, settings.like(answer), (&items, run)).ok()?.values;
+        let all = runs.residuals(Way::Whole, &values, steps).ok()?;
         for (part, items) in runs.parts.iter().zip(runs.items()) {
             let is_unseen = seen(part, 1 - half);
             for (k, item) in items.zip(&part.asks.items) {
@@ -395,51 +414,72 @@ pub struct Remarks {
     pub begins_badly: bool,
 }
 
+/// A column on which residuals may depend, by the rows of the recording.
+enum Column<'c> {
+    Values(&'c [f64]),
+    /// The slope over these times.
+    Slope(&'c [f64], &'c [f64]),
+}
+
+impl Column<'_> {
+    /// At some of the rows, or at all.
+    fn at(&self, rows: Option<&[usize]>) -> Cow<'_, [f64]> {
+        let slope = |times: &[f64], values: &[f64], row: usize| {
+            let (a, b) = (row.saturating_sub(1), (row + 1).min(times.len() - 1));
+            (values[b] - values[a]) / (times[b] - times[a])
+        };
+        match (self, rows) {
+            (Column::Values(values), None) => Cow::from(*values),
+            (Column::Values(values), Some(rows)) => rows.iter().map(|row| values[*row]).collect(),
+            (Column::Slope(times, values), None) => (0..times.len()).map(|row| slope(times, values, row)).collect(),
+            (Column::Slope(times, values), Some(rows)) => rows.iter().map(|row| slope(times, values, *row)).collect(),
+        }
+    }
+}
+
 /// Remarks on each compared quantity of a run.
 pub fn remarks(part: &Part, answer: &Answer, items: std::ops::Range<usize>) -> Vec<Remarks> {
-    let rows: Vec<usize> = {
-        let (after, before) = part.asks.window;
-        (0..part.asks.rows.len()).filter(|row| (after..=before).contains(&part.asks.rows[*row])).collect()
-    };
+    // Without a window and a filter, each row of the recording has a residual.
+    let (after, before) = part.asks.window;
+    let is_within = |row: &usize| (after..=before).contains(&part.asks.rows[*row]);
+    let is_whole = part.instants.len() == part.asks.rows.len();
     let mut names: Vec<(String, Unit)> = Vec::new();
-    let mut columns: Vec<Vec<f64>> = Vec::new();
+    let mut columns: Vec<Column> = Vec::new();
     if !part.asks.steady {
         names.push(("t".into(), Unit::parse("s").expect("it is known")));
-        columns.push(part.instants.clone());
+        columns.push(Column::Values(&part.asks.rows));
     }
     // Residuals depend on what they were computed from.
     let is_compared =
         |name: &str| part.asks.items.iter().any(|item| item.sides.iter().flatten().any(|(side, _)| side == name));
     for (name, unit, values) in part.asks.columns.iter().filter(|(name, ..)| !is_compared(name)) {
         names.push((name.clone(), unit.clone()));
-        columns.push(rows.iter().map(|row| values[*row]).collect());
+        columns.push(Column::Values(values));
         // A sensor that is late or has inertia leaves what the rate of the motion explains.
-        let times = &part.asks.rows;
-        if !part.asks.steady && times.len() > 2 {
+        if !part.asks.steady && part.asks.rows.len() > 2 {
             let text = if unit.text.is_empty() { "1/s".into() } else { format!("{}/s", unit.text) };
             names.push((format!("slope({name})"), Unit { text, ..unit.clone() }));
-            let slope = |row: &usize| {
-                let (a, b) = (row.saturating_sub(1), (row + 1).min(times.len() - 1));
-                (values[b] - values[a]) / (times[b] - times[a])
-            };
-            columns.push(rows.iter().map(slope).collect());
+            columns.push(Column::Slope(&part.asks.rows, values));
         }
     }
     let states: Vec<usize> = (0..names.len()).filter(|k| names[*k].0.starts_with("data.")).collect();
     let one = |(k, item): (usize, &crate::compile::FitItem)| {
-        let left = item.kept(&part.instants);
-        let columns: Vec<Vec<f64>> =
-            columns.iter().map(|column| left.iter().map(|row| column[*row]).collect()).collect();
-        let slices: Vec<&[f64]> = columns.iter().map(Vec::as_slice).collect();
-        let of_states: Vec<&[f64]> = states.iter().map(|k| slices[*k]).collect();
         let (residuals, noise) = (&answer.residuals[k], &answer.noise[k]);
-        let (kept, white): (Vec<usize>, _) = (noise.kept(residuals.len()).collect(), noise.whitened(residuals));
-        let found = with(|with| statistics::dependence(residuals, (&kept, &white), &slices, with));
+        // Rows of the recording that have a residual, where others have none.
+        let rows: Option<Vec<usize>> = (!is_whole || item.thin.is_some()).then(|| {
+            let within: Vec<usize> = (0..part.asks.rows.len()).filter(is_within).collect();
+            item.kept(&part.instants).into_iter().map(|row| within[row]).collect()
+        });
+        let column = |k: usize| columns[k].at(rows.as_deref());
+        let mut white = vec![f64::NAN; residuals.len()];
+        noise.kept(residuals.len()).zip(noise.whitening(residuals)).for_each(|(row, r)| white[row] = r);
+        let found = with(|with| statistics::dependence((residuals, &white), (columns.len(), &column), with));
         let depends = found.map(|found| {
             let (name, unit) = names[found.column].clone();
             (name, unit, found)
         });
-        let found = statistics::concentration(residuals, &of_states).filter(|_| depends.is_none());
+        let of_states = |k: usize| column(states[k]);
+        let found = statistics::concentration(residuals, (states.len(), &of_states)).filter(|_| depends.is_none());
         let lies = found.map(|found| {
             let (name, unit) = names[states[found.column]].clone();
             (name, unit, found)
@@ -450,11 +490,12 @@ pub fn remarks(part: &Part, answer: &Answer, items: std::ops::Range<usize>) -> V
             let head = residuals.len() / 10;
             found.rows.iter().all(|row| *row < head) && found.tenth.as_ref().is_none_or(|tenth| tenth.start == 0)
         };
-        let outliers =
-            statistics::outliers(residuals, (&kept, &white)).filter(|found| !(begins_badly && is_beginning(found)));
+        let outliers = statistics::outliers(residuals, &white).filter(|found| !(begins_badly && is_beginning(found)));
+        let left = item.thin.as_ref().map(|_| item.kept(&part.instants));
+        let instant = |row: usize| left.as_ref().map_or(row, |left| left[row]);
         let of_rows = |found: Outliers| Outliers {
-            rows: found.rows.into_iter().map(|row| left[row]).collect(),
-            tenth: found.tenth.map(|tenth| left[tenth.start]..left[tenth.end - 1] + 1),
+            rows: found.rows.into_iter().map(instant).collect(),
+            tenth: found.tenth.map(|tenth| instant(tenth.start)..instant(tenth.end - 1) + 1),
         };
         // Where the error lies in values of a column, its largest rows are no outliers.
         let outliers = outliers.map(of_rows).filter(|_| lies.is_none());

@@ -693,24 +693,27 @@ pub fn as_written(runs: &Runs, residuals: &[Vec<f64>]) -> String {
     out
 }
 
-/// The compared rows as CSV: time, or the number of the steady point, then each difference with its two sides.
-/// `values`: row by row, first all differences, then all sides.
-pub fn table(asks: &Asks, instants: &[f64], values: &[f64]) -> String {
-    let mut titles = vec![if asks.steady { "point" } else { "t [s]" }.to_string()];
-    let mut units: Vec<&Unit> = Vec::new();
-    for item in &asks.items {
-        titles.push(format!("{} [{}]", item.text, unit_text(&item.unit)));
-        units.push(&item.unit);
-    }
-    for item in &asks.items {
-        for (text, _) in item.sides.iter().flatten() {
-            titles.push(format!("{text} [{}]", unit_text(&item.unit)));
-            units.push(&item.unit);
-        }
-    }
-    let mut out = titles.iter().map(|title| quoted(title)).collect::<Vec<_>>().join(",") + "\n";
+/// The columns of the compared rows beside time: first all differences, then both sides of each.
+fn shown(asks: &Asks) -> Vec<(&str, &Unit)> {
+    let differences = asks.items.iter().map(|item| (&item.text[..], &item.unit));
+    let sides = asks.items.iter().flat_map(|item| item.sides.iter().flatten().map(|(text, _)| (&text[..], &item.unit)));
+    differences.chain(sides).collect()
+}
+
+/// The heading of the compared rows as CSV.
+pub fn heading(asks: &Asks) -> String {
+    let time = if asks.steady { "point" } else { "t [s]" }.to_string();
+    let titles = shown(asks).into_iter().map(|(text, unit)| format!("{text} [{}]", unit_text(unit)));
+    std::iter::once(time).chain(titles).map(|title| quoted(&title)).collect::<Vec<_>>().join(",") + "\n"
+}
+
+/// Some of these rows: time, or the number of the steady point, then the columns. `values`: row by row; `first`: the
+/// number of the first one.
+pub fn lines(asks: &Asks, (first, instants): (usize, &[f64]), values: &[f64]) -> String {
+    let units: Vec<&Unit> = shown(asks).into_iter().map(|(_, unit)| unit).collect();
+    let mut out = String::new();
     for (row, t) in instants.iter().enumerate() {
-        out += &if asks.steady { (row + 1).to_string() } else { abi::format::plain(*t) };
+        out += &if asks.steady { (first + row + 1).to_string() } else { abi::format::plain(*t) };
         for (value, unit) in values[row * units.len()..].iter().zip(&units) {
             out += ",";
             out += &abi::format::plain(unit.from_si(*value));

@@ -24,8 +24,8 @@ const LAGS: usize = 40;
 pub struct PageRun<'a> {
     /// The run with the values found.
     pub recording: &'a Recording,
-    /// The compared rows: of each, all differences, then all sides.
-    pub rows: Vec<f64>,
+    /// Every n-th of the compared rows: its number, all differences, then all sides.
+    pub rows: Vec<(usize, Vec<f64>)>,
 }
 
 /// The page.
@@ -180,16 +180,14 @@ fn compared(fitted: &Fitted, runs: &Runs) -> String {
     out + "</table>\n"
 }
 
-/// Every n-th of many rows.
-fn thinned(rows: usize) -> impl Iterator<Item = usize> {
-    (0..rows).step_by(rows.div_ceil(MOST_POINTS).max(1))
+/// Which of so many rows are drawn: every n-th.
+pub fn every(rows: usize) -> usize {
+    rows.div_ceil(MOST_POINTS).max(1)
 }
 
 /// Both sides of each difference over time, or over the number of the point.
-fn measured(part: &Part, rows: &[f64]) -> Vec<Panel> {
+fn measured(part: &Part, rows: &[(usize, Vec<f64>)]) -> Vec<Panel> {
     let asks = &part.asks;
-    let width =
-        asks.items.len() + asks.items.iter().map(|item| if item.sides.is_some() { 2 } else { 0 }).sum::<usize>();
     let mut at = asks.items.len();
     let mut out = Vec::new();
     for item in &asks.items {
@@ -197,8 +195,7 @@ fn measured(part: &Part, rows: &[f64]) -> Vec<Panel> {
         let curve = |k: usize| {
             let name = sides[k].0.clone();
             let recorded = name.starts_with("data.");
-            let points = thinned(part.instants.len())
-                .map(|row| (time(part, row), item.unit.from_si(rows[row * width + at + k])));
+            let points = rows.iter().map(|(row, values)| (time(part, *row), item.unit.from_si(values[at + k])));
             Curve { name, points: points.collect(), recorded, ..Curve::default() }
         };
         let mut curves = vec![curve(0), curve(1)];
@@ -228,7 +225,10 @@ fn residuals(part: &Part, item: &FitItem, rows: &[f64]) -> Vec<Panel> {
     let compared: Vec<usize> =
         (0..part.asks.rows.len()).filter(|row| (after..=before).contains(&part.asks.rows[*row])).collect();
     let of = |x: Axis, at: &dyn Fn(usize) -> f64| {
-        let points = thinned(rows.len()).map(|row| (at(row), unit.from_si(rows[row]) - unit.from_si(0.0))).collect();
+        let points = (0..rows.len())
+            .step_by(every(rows.len()))
+            .map(|row| (at(row), unit.from_si(rows[row]) - unit.from_si(0.0)))
+            .collect();
         let curve = Curve { name: text.clone(), points, recorded: true, ..Curve::default() };
         Panel { x, y: y(), curves: vec![curve], legend: false, ..Panel::default() }
     };

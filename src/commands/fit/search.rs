@@ -9,13 +9,17 @@ use crate::compile::{self, ElementaryFunction, HELD, Varying};
 use abi::plan::{Experiment, Method, Solver};
 use abi::{Instance, Slot};
 use grammar::span::Span;
-use runtime::engine::{self, Cause, Continue, Failure, lanes};
+use runtime::engine::tiles::{Missing, Tiles};
+use runtime::engine::{self, Cause, Continue, Failure};
 use runtime::fit::statistics::intervals;
 use runtime::fit::{
-    Answer, Elementary, Estimator, Finer, Item, Journal, Limits, Minima, Question, Rows, Trouble, Unknown, Way,
+    Answer, Elementary, Estimator, Finer, Item, Journal, Limits, Minima, Question, Rows, Tile, Trouble, Unknown, Way,
 };
 use std::ops::Range;
+use std::sync::Arc;
 
+/// Rows of all runs that are in memory at once.
+const TILE: usize = 65_536;
 /// When a search ends.
 const LIMITS: Limits = Limits { trials: 100, tolerance: 1e-8 };
 /// A step is short enough if a quarter of it moves no value by more than this part of its standard deviation. At the kinks
@@ -56,7 +60,7 @@ pub struct Part {
     /// What is asked.
     pub asks: compile::Asks,
     /// The compared rows, in s.
-    pub instants: Vec<f64>,
+    pub instants: Arc<[f64]>,
     /// The compared quantities.
     pub slots: Vec<Slot>,
     held: Option<Held>,
@@ -73,6 +77,12 @@ struct Held {
 
 /// Values of a run at its rows, or why it failed.
 pub type Residuals = Result<Vec<Vec<f64>>, String>;
+
+/// Receives some instants and the values there, row-major.
+type Sampled<'s> = dyn FnMut(&[f64], &[f64]) -> Result<(), String> + 's;
+
+/// Receives for each run some rows of the compared quantities, none if it has failed; and whether these are all rows.
+type Passed<'p> = dyn FnMut(Vec<Option<&[Vec<f64>]>>, bool) + 'p;
 
 impl Part {
     fn new(part: compile::FitPart, threads: usize) -> Part {
@@ -92,7 +102,11 @@ impl Part {
             Some(Held { varying, pole, slots })
         });
         let (after, before) = asks.window;
-        let instants = asks.rows.iter().copied().filter(|t| (after..=before).contains(t)).collect();
+        let is_within = |t: &f64| (after..=before).contains(t);
+        let instants = match asks.rows.iter().all(is_within) {
+            true => asks.rows.clone(),
+            false => asks.rows.iter().copied().filter(is_within).collect(),
+        };
         let slots = asks.items.iter().map(|item| item.slot).collect();
         Part { threads, varying, asks, instants, slots, held }
     }
@@ -189,85 +203,51 @@ impl Part {
         Ok((made.instance, experiment))
     }
 
-    /// Values of the slots at these instants for each of these sets of values of all unknowns.
+    /// Values of the slots at these instants for a set of values of all unknowns: row-major, some rows after the other. An
+    /// error of `each` ends the run.
     pub fn sampled(
         &self,
-        points: &[Vec<f64>],
+        values: &[f64],
         step: f64,
-        instants: &[f64],
-        slots: &[Slot],
-    ) -> Vec<Result<Vec<f64>, String>> {
-        let points: Vec<Vec<(Slot, f64)>> = points.iter().map(|values| self.own(values)).collect();
-        self.sampled_of(Way::Whole, &points, step, instants, slots)
+        (instants, slots): (&Arc<[f64]>, &[Slot]),
+        each: &mut Sampled,
+    ) -> Result<(), String> {
+        let made = self.made(Way::Whole, &self.own(values), step, instants)?;
+        let mut tiles = Tiles::new(None, vec![made], (instants, slots), 1);
+        for times in instants.chunks(TILE) {
+            let values = tiles.next(TILE).remove(0).map_err(|missing| why(&missing))?;
+            each(times, &values)?;
+        }
+        Ok(())
     }
 
-    /// The same for sets of values of the slots: in lanes if there are enough to fill them.
-    fn sampled_of(
+    /// The same for many sets of values, in memory.
+    pub fn sampled_all(&self, points: &[Vec<f64>], step: f64, slots: &[Slot]) -> Vec<Result<Vec<f64>, String>> {
+        let instants = &self.asks.rows;
+        let mut all = Vec::new();
+        let made: Vec<Result<(), String>> = points
+            .iter()
+            .map(|values| self.made(Way::Whole, &self.own(values), step, instants).map(|made| all.push(made)))
+            .collect();
+        let mut tiles = Tiles::new(self.varying.lanes(), all, (instants, slots), self.threads);
+        let mut values = tiles.next(instants.len()).into_iter();
+        let mut next = || values.next().expect("one for each run").map_err(|missing| why(&missing));
+        made.into_iter().map(|made| made.and_then(|()| next())).collect()
+    }
+
+    /// Compared minus recorded at these rows, for each of these sets of values of all unknowns, in lanes if there are enough
+    /// to fill them: passes some rows of all after the other, with whether these are all. Values on which this recording
+    /// does not depend cost no run.
+    fn pass(
         &self,
         way: Way,
-        points: &[Vec<(Slot, f64)>],
+        points: &[Vec<f64>],
         step: f64,
-        instants: &[f64],
-        slots: &[Slot],
-    ) -> Vec<Result<Vec<f64>, String>> {
-        let mut out: Vec<Option<Result<Vec<f64>, String>>> = points.iter().map(|_| None).collect();
-        let (mut places, mut all) = (Vec::new(), Vec::new());
-        for (place, given) in points.iter().enumerate() {
-            match self.made(way, given, step, instants) {
-                Ok(made) => {
-                    places.push(place);
-                    all.push(made);
-                }
-                Err(why) => out[place] = Some(Err(why)),
-            }
-        }
-        let varying = match (way, &self.held) {
-            (Way::Held(_), Some(held)) => &held.varying,
-            _ => &self.varying,
-        };
-        let results = shared(all, self.threads, varying.lanes().map_or(1, |lanes| lanes.width()), &|all| {
-            let watch = &mut |_| Continue::Continue(());
-            match varying.lanes().filter(|lanes| all.len() >= lanes.width() / 2) {
-                Some(code) => lanes::sample(code, all, instants, slots, watch),
-                None => {
-                    let mut one = |(instance, experiment): (Instance, Experiment)| {
-                        engine::sample(instance, &experiment, instants, slots, watch)
-                    };
-                    all.into_iter().map(&mut one).collect()
-                }
-            }
-        });
-        for (place, (values, ended)) in places.into_iter().zip(results) {
-            out[place] = Some(match ended {
-                Err(failure) => Err(cause(&failure)),
-                Ok(()) if values.len() < instants.len() * slots.len() => {
-                    Err("the run ends before the recording".into())
-                }
-                Ok(()) => Ok(values),
-            });
-        }
-        out.into_iter().map(|one| one.expect("each was run or refused")).collect()
-    }
-
-    /// Compared minus recorded at these rows, for each of these sets of values of all unknowns. Values on which this
-    /// recording does not depend cost no run.
-    pub(super) fn residuals_at(&self, way: Way, points: &[Vec<f64>], step: f64, instants: &[f64]) -> Vec<Residuals> {
-        let slots = match (way, &self.held) {
-            (Way::Held(_), Some(held)) => &held.slots,
-            _ => &self.slots,
-        };
-        let width = slots.len();
-        let split = |values: Vec<f64>| -> Residuals {
-            if let Some(bad) = values.iter().position(|value| !value.is_finite()) {
-                let item = &self.asks.items[bad % width];
-                return Err(format!("`{}` is not a finite number", item.text));
-            }
-            let of = |k: usize| {
-                let rows: Vec<f64> = values.iter().skip(k).step_by(width).copied().collect();
-                self.asks.items[k].thin.as_ref().map_or_else(|| rows.clone(), |thin| thin.of(instants, &rows))
-            };
-            Ok((0..width).map(of).collect())
-        };
+        instants: &Arc<[f64]>,
+        each: &mut Passed,
+    ) -> Vec<Result<(), String>> {
+        let held = self.held.as_ref().filter(|_| matches!(way, Way::Held(_)));
+        let slots = held.map_or(&self.slots, |held| &held.slots);
         let mut different: Vec<Vec<(Slot, f64)>> = Vec::new();
         let place = |values: &Vec<f64>| {
             let own = self.own(values);
@@ -278,9 +258,66 @@ impl Part {
             })
         };
         let places: Vec<usize> = points.iter().map(place).collect();
-        let found = self.sampled_of(way, &different, step, instants, slots);
-        let found: Vec<Residuals> = found.into_iter().map(|one| one.and_then(split)).collect();
-        places.into_iter().map(|place| found[place].clone()).collect()
+        let mut ended: Vec<Result<(), String>> = Vec::new();
+        let (mut numbers, mut all) = (Vec::new(), Vec::new());
+        for (number, given) in different.iter().enumerate() {
+            ended.push(self.made(way, given, step, instants).map(|made| {
+                numbers.push(number);
+                all.push(made);
+            }));
+        }
+        let varying = held.map_or(&self.varying, |held| &held.varying);
+        let mut tiles = Tiles::new(varying.lanes(), all, (instants, slots), self.threads);
+        // The filter of `thin` goes forward and backward over all rows.
+        let is_filtered = self.asks.items.iter().any(|item| item.thin.is_some());
+        let rows = if is_filtered { instants.len() } else { TILE };
+        for _ in instants.chunks(rows.max(1)) {
+            let mut found: Vec<Option<Vec<Vec<f64>>>> = different.iter().map(|_| None).collect();
+            for (number, values) in numbers.iter().zip(tiles.next(rows)) {
+                if ended[*number].is_ok() {
+                    let residuals = values.map_err(|missing| why(&missing));
+                    let residuals = residuals.and_then(|values| self.split(values, instants));
+                    match residuals {
+                        Ok(residuals) => found[*number] = Some(residuals),
+                        Err(why) => ended[*number] = Err(why),
+                    }
+                }
+            }
+            each(places.iter().map(|place| found[*place].as_deref()).collect(), instants.len() <= rows);
+        }
+        places.into_iter().map(|place| ended[place].clone()).collect()
+    }
+
+    /// The residuals of each compared quantity, from their values row by row. `instants`: of all rows.
+    fn split(&self, values: Vec<f64>, instants: &[f64]) -> Residuals {
+        let width = self.slots.len();
+        if let Some(bad) = values.iter().position(|value| !value.is_finite()) {
+            let item = &self.asks.items[bad % width];
+            return Err(format!("`{}` is not a finite number", item.text));
+        }
+        let columns = match width {
+            1 => vec![values],
+            _ => (0..width).map(|k| values.iter().skip(k).step_by(width).copied().collect()).collect(),
+        };
+        let thinned = |(rows, item): (Vec<f64>, &compile::FitItem)| match &item.thin {
+            Some(thin) => thin.of(instants, &rows),
+            None => rows,
+        };
+        Ok(columns.into_iter().zip(&self.asks.items).map(thinned).collect())
+    }
+
+    /// The same in memory, all rows together.
+    fn residuals_at(&self, way: Way, points: &[Vec<f64>], step: f64, instants: &Arc<[f64]>) -> Vec<Residuals> {
+        let mut all: Vec<Vec<Vec<f64>>> = vec![vec![Vec::new(); self.slots.len()]; points.len()];
+        let ended = self.pass(way, points, step, instants, &mut |rows, is_all| {
+            for (all, rows) in all.iter_mut().zip(rows) {
+                for (column, rows) in all.iter_mut().zip(rows.unwrap_or_default()) {
+                    column.reserve_exact(if is_all { rows.len() } else { instants.len() - column.len() });
+                    column.extend_from_slice(rows);
+                }
+            }
+        });
+        ended.into_iter().zip(all).map(|(ended, all)| ended.map(|()| all)).collect()
     }
 
     /// The compared measures of a run with steps of this length, in SI: integrals over time, unlike sums over rows.
@@ -297,11 +334,15 @@ impl Part {
     /// The number of steady points at which a compared quantity still moved by a noticeable part of its residuals in
     /// the second half of the hold. `rms`: the residuals of its compared quantities.
     pub fn unsettled(&self, values: &[f64], rms: &[f64]) -> usize {
-        let pairs: Vec<f64> = self.instants.iter().flat_map(|t| [t - 0.5 * HELD, *t]).collect();
-        let Ok(values) = self.sampled(&[values.to_vec()], self.step(), &pairs, &self.slots).remove(0) else { return 0 };
+        let pairs: Arc<[f64]> = self.instants.iter().flat_map(|t| [t - 0.5 * HELD, *t]).collect();
         let width = self.slots.len();
         let moves = |pair: &&[f64]| (0..width).any(|k| (pair[k] - pair[width + k]).abs() > PART_OF_RESIDUALS * rms[k]);
-        values.chunks(2 * width).filter(moves).count()
+        let mut count = 0;
+        let sampled = self.sampled(values, self.step(), (&pairs, &self.slots), &mut |_, values| {
+            count += values.chunks(2 * width).filter(moves).count();
+            Ok(())
+        });
+        sampled.map_or(0, |()| count)
     }
 }
 
@@ -354,11 +395,15 @@ impl Runs {
     }
 
     /// The search's view of what is compared at some of the compared rows of each recording.
-    pub(super) fn compared(&self, rows: &dyn Fn(&Part) -> Vec<usize>) -> Vec<Item> {
+    pub(super) fn compared(&self, rows: &dyn Fn(&Part) -> Option<Vec<usize>>) -> Vec<Item> {
         let of = |part: &Part| {
-            let times: Vec<f64> = rows(part).into_iter().map(|row| part.instants[row]).collect();
             let one = |item: &compile::FitItem| {
-                let times: Vec<f64> = item.kept(&times).into_iter().map(|row| times[row]).collect();
+                let thinned = |times: &[f64]| item.kept(times).into_iter().map(|row| times[row]).collect();
+                let times: Arc<[f64]> = match (rows(part), &item.thin) {
+                    (None, None) => part.instants.clone(),
+                    (None, Some(_)) => thinned(&part.instants),
+                    (Some(rows), _) => thinned(&rows.into_iter().map(|row| part.instants[row]).collect::<Vec<f64>>()),
+                };
                 let rows = match intervals(&times) {
                     _ if part.asks.steady => Rows::Independent,
                     Some(gaps) => Rows::Even(gaps),
@@ -373,7 +418,7 @@ impl Runs {
 
     /// The same at all of them.
     pub fn compared_whole(&self) -> Vec<Item> {
-        self.compared(&|part| (0..part.instants.len()).collect())
+        self.compared(&|_| None)
     }
 
     /// What is known of other minima.
@@ -385,72 +430,90 @@ impl Runs {
         }
     }
 
-    /// Compared minus recorded, at the compared rows, for each of these sets of values.
-    pub fn residuals(&self, way: Way, points: &[Vec<f64>], steps: &[f64]) -> Vec<Residuals> {
-        let rows = |part: &Part| match way {
-            Way::Whole | Way::Held(_) => part.instants.len(),
-            Way::First(share) => ((share * part.instants.len() as f64).ceil() as usize).clamp(1, part.instants.len()),
-        };
-        let of = |(part, step): (&Part, &f64)| match (way, &part.held) {
-            // A recording to which no run can be held counts as it is.
-            (Way::Held(_), None) => part.residuals_at(Way::Whole, points, *step, &part.instants),
-            _ => part.residuals_at(way, points, *step, &part.instants[..rows(part)]),
-        };
-        joined(points.len(), self.parts.iter().zip(steps).map(of))
+    /// The model as the search runs it, with these steps.
+    pub fn with<'r>(&'r self, steps: &'r [f64]) -> Stepped<'r> {
+        Stepped { runs: self, steps, rows: None }
     }
 
+    /// Compared minus recorded, at the compared rows, for one set of values.
+    pub fn residuals(&self, way: Way, values: &[f64], steps: &[f64]) -> Residuals {
+        runtime::fit::Runs::run(&mut self.with(steps), way, &[values.to_vec()]).remove(0)
+    }
+}
+
+/// The runs of a fit with steps of given lengths.
+#[derive(Clone)]
+pub struct Stepped<'r> {
+    runs: &'r Runs,
+    steps: &'r [f64],
+    /// The instants of each part, if not all of its rows are compared.
+    rows: Option<Vec<Arc<[f64]>>>,
+}
+
+impl Stepped<'_> {
     /// The same at some of the compared rows of each recording.
-    pub fn residuals_at(
-        &self,
-        points: &[Vec<f64>],
-        steps: &[f64],
-        rows: &dyn Fn(&Part) -> Vec<usize>,
-    ) -> Vec<Residuals> {
-        let of = |(part, step): (&Part, &f64)| {
-            let instants: Vec<f64> = rows(part).into_iter().map(|row| part.instants[row]).collect();
-            part.residuals_at(Way::Whole, points, *step, &instants)
+    pub fn at(self, rows: &dyn Fn(&Part) -> Vec<usize>) -> Self {
+        let of = |part: &Part| rows(part).into_iter().map(|row| part.instants[row]).collect();
+        Stepped { rows: Some(self.runs.parts.iter().map(of).collect()), ..self }
+    }
+
+    /// For each part its number, the way in which it is run, and the instants at which it is compared.
+    fn parts(&self, way: Way) -> impl Iterator<Item = (usize, Way, Arc<[f64]>)> {
+        self.runs.parts.iter().enumerate().map(move |(k, part)| {
+            let rows = self.rows.as_ref().map_or(&part.instants, |rows| &rows[k]);
+            match (way, &part.held) {
+                // A recording to which no run can be held counts as it is.
+                (Way::Held(_), None) => (k, Way::Whole, rows.clone()),
+                (Way::Whole | Way::Held(_), _) => (k, way, rows.clone()),
+                (Way::First(share), _) => {
+                    let count = ((share * rows.len() as f64).ceil() as usize).clamp(1, rows.len());
+                    (k, way, Arc::from(&rows[..count]))
+                }
+            }
+        })
+    }
+}
+
+impl runtime::fit::Runs for Stepped<'_> {
+    fn run(&mut self, way: Way, points: &[Vec<f64>]) -> Vec<Residuals> {
+        let of = |(k, way, instants): (usize, Way, Arc<[f64]>)| {
+            self.runs.parts[k].residuals_at(way, points, self.steps[k], &instants)
         };
-        joined(points.len(), self.parts.iter().zip(steps).map(of))
-    }
-}
-
-/// Divides a list among threads, calls a function with each share, and joins the results in order. Shares are multiples
-/// of `width`, so that lanes are full. The bits of a run do not depend on its share.
-fn shared<A: Send, B: Send>(
-    mut all: Vec<A>,
-    threads: usize,
-    width: usize,
-    of: &(dyn Fn(Vec<A>) -> Vec<B> + Sync),
-) -> Vec<B> {
-    let share = all.len().div_ceil(threads.max(1)).next_multiple_of(width.max(1));
-    if all.len() <= share {
-        return of(all);
-    }
-    let mut shares = Vec::new();
-    while all.len() > share {
-        let rest = all.split_off(share);
-        shares.push(std::mem::replace(&mut all, rest));
-    }
-    shares.push(all);
-    std::thread::scope(|scope| {
-        let running: Vec<_> = shares.into_iter().map(|share| scope.spawn(move || of(share))).collect();
-        running.into_iter().flat_map(|one| one.join().expect("a run does not panic")).collect()
-    })
-}
-
-/// The residuals of several recordings together.
-fn joined(points: usize, parts: impl Iterator<Item = Vec<Residuals>>) -> Vec<Residuals> {
-    let mut out: Vec<Residuals> = vec![Ok(Vec::new()); points];
-    for part in parts {
-        for (all, one) in out.iter_mut().zip(part) {
-            match (&mut *all, one) {
-                (Ok(all), Ok(one)) => all.extend(one),
-                (Ok(_), Err(why)) => *all = Err(why),
-                (Err(_), _) => {}
+        let mut out: Vec<Residuals> = vec![Ok(Vec::new()); points.len()];
+        for part in self.parts(way).map(of) {
+            for (all, one) in out.iter_mut().zip(part) {
+                match (&mut *all, one) {
+                    (Ok(all), Ok(one)) => all.extend(one),
+                    (Ok(_), Err(why)) => *all = Err(why),
+                    (Err(_), _) => {}
+                }
             }
         }
+        out
     }
-    out
+
+    fn pass(&mut self, way: Way, points: &[Vec<f64>], each: &mut dyn FnMut(&Tile)) -> Vec<Result<(), String>> {
+        let mut ended: Vec<Result<(), String>> = vec![Ok(()); points.len()];
+        for ((k, way, instants), items) in self.parts(way).zip(self.runs.items()) {
+            let found = self.runs.parts[k].pass(way, points, self.steps[k], &instants, &mut |rows, is_all| {
+                each(&Tile { items: items.clone(), rows, is_all });
+            });
+            for (ended, found) in ended.iter_mut().zip(found) {
+                if ended.is_ok() {
+                    *ended = found;
+                }
+            }
+        }
+        ended
+    }
+}
+
+/// Why a run has no values.
+fn why(missing: &Missing) -> String {
+    match missing {
+        Missing::Failed(failure) => cause(failure),
+        Missing::Ended => "the run ends before the recording".into(),
+    }
 }
 
 /// The cause of a failure without its numbers, so that equal causes count together.
@@ -512,16 +575,13 @@ pub struct Coarse {
     pub by: Result<(usize, f64), String>,
 }
 
-/// Runs a model in some way with sets of values.
-pub(super) type Model<'a> = dyn FnMut(Way, &[Vec<f64>]) -> Vec<Residuals> + 'a;
-
 /// Estimates the unknowns from some rows.
 pub(super) fn estimate(
     runs: &Runs,
     unknowns: &[Unknown],
     items: &[Item],
     settings: Settings,
-    (run, finer): (&mut Model, Option<&mut Finer>),
+    (run, finer): (&mut dyn runtime::fit::Runs, Option<&mut Finer>),
 ) -> Result<Answer, Trouble> {
     let (exp, log) = (ElementaryFunction::exp(), ElementaryFunction::log());
     let mut kept = runs.kept.clone();
@@ -561,7 +621,7 @@ fn searched(runs: &Runs, written: &[f64], settings: Settings) -> Result<Found, T
     let mut spent = 0;
     let mut judged = None;
     loop {
-        let mut run = |way: Way, points: &[Vec<f64>]| runs.residuals(way, points, &steps);
+        let mut run = runs.with(&steps);
         let mut finer = |values: &[f64]| {
             let one = |k: &usize| {
                 let part = &runs.parts[*k];
