@@ -5,6 +5,8 @@
 
 mod kept;
 pub mod search;
+#[cfg(test)]
+mod differences;
 mod after;
 mod answer;
 mod page;
