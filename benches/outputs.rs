@@ -3,6 +3,7 @@
 //! (`gcc -O3 -march=native`). All are interleaved in one run; ratios are of medians over rounds.
 //!
 //! Many steps are one call, as in a run that observes only its end; then whole runs follow, which observe every step.
+//! Last, the contact alone: its speed comes from an array, and its force is written to another one after every step.
 //! `cargo bench --bench outputs`. The number of instructions of one row: `perf stat -e instructions:u` with
 //! `FRIC_ROW=text,method,row`, each counted from 0; the C of a method is row 3, and 4 with the force.
 
@@ -16,8 +17,10 @@ mod compile {
     pub use compiler::Sources;
 }
 
+use abi::follow::{Rows, RowsMut};
 use abi::plan::Method;
 use abi::{Instance, Slice, Slot};
+use compiler::codegen::tiering;
 use compiler::ir::program::Program;
 use runtime::engine::{Continue, run};
 use std::sync::Arc;
@@ -59,7 +62,27 @@ model Top {
     ),
 ];
 
+/// The contact alone.
+const CONTACT: &str = "model Contact {
+  input  v [m/s]
+  param  sigma0 = 1e5 N/m    param sigma1 = 316 N·s/m   param sigma2 = 0.4 N·s/m
+  param  Fc = 1 N            param Fs = 1.5 N           param vs = 1 mm/s
+  let    g = Fc + (Fs - Fc) * exp(-(v / vs)^2)
+  state  z [um] = 0
+  dz/dt  = v - sigma0 * abs(v) / g * z
+  output F [N] = sigma0 * z + sigma1 * dz/dt + sigma2 * v
+}";
+
 type Hand = unsafe extern "C" fn(state: *mut f64, params: *const f64, h: f64, count: u64);
+/// The same with an array of inputs and one for outputs.
+type Rowwise = unsafe extern "C" fn(
+    state: *mut f64,
+    params: *const f64,
+    h: f64,
+    count: u64,
+    inputs: *const f64,
+    outputs: *mut f64,
+);
 
 fn program(text: &str, declaration: &str) -> Program {
     let text = text.replace("OUTPUT", declaration);
@@ -143,6 +166,48 @@ fn main() {
     }
     if only.is_none() {
         runs();
+        contact(&library);
+    }
+}
+
+/// The contact alone under a speed of 10 mm/s and 1 Hz.
+fn contact(library: &libloading::Library) {
+    println!("contact alone, its speed from an array, its force to another one");
+    let mut loaded = compiler::load("contact.fric", CONTACT, &project::Disk);
+    let changes = compiler::Changes::default();
+    let built = compiler::build(&mut loaded, &project::Disk, "Contact", &changes, &mut Vec::new());
+    let program = built.map_err(|found| format!("{found:?}")).expect("it compiles").program;
+    let slot = |path: &str| program.description.quantity(path).expect("it is declared").slot;
+    const COUNT: usize = 20_000;
+    #[allow(clippy::disallowed_methods, reason = "both get the same speeds")]
+    let speeds: Vec<f64> = (0..COUNT).map(|n| 0.01 * (std::f64::consts::TAU * n as f64 / COUNT as f64).sin()).collect();
+    for method in [Method::Euler, Method::Rk4] {
+        let name = format!("contact_{}", method.name());
+        // SAFETY: the source has functions of these names and of this type.
+        let hand = *unsafe { library.get::<Rowwise>(name.as_bytes()) }.expect("it is in the source");
+        let follow = tiering::follow(&program, method, &[slot("v")], &[slot("F")], false);
+        assert!(follow.is_compiled());
+        let mut ours = instance(&program, method);
+        let (mut z, mut forces, mut times) = (0.0, [vec![0.0; COUNT], vec![0.0; COUNT]], [const { Vec::new() }; 2]);
+        for _ in 0..301 {
+            let [theirs, rows] = &mut forces;
+            let begun = Instant::now();
+            // SAFETY: one state, fourteen parameters, and as many numbers in the arrays as steps.
+            unsafe { hand(&mut z, PARAMS.as_ptr(), H, COUNT as u64, speeds.as_ptr(), theirs.as_mut_ptr()) };
+            times[0].push(begun.elapsed().as_secs_f64() / COUNT as f64 * 1e9);
+            let begun = Instant::now();
+            let from = Rows { numbers: &speeds, stride: 1 };
+            let ended = ours.follow(&follow, from, RowsMut { numbers: rows, stride: 1 }, COUNT as u64);
+            times[1].push(begun.elapsed().as_secs_f64() / COUNT as f64 * 1e9);
+            assert_eq!(ended, (COUNT as u64, 0));
+        }
+        let off = forces[0].iter().zip(&forces[1]).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+        let [gcc, ours] = times.map(median);
+        println!(
+            "  {}: gcc {gcc:.2} ns a step, ours {ours:.2}, ratio {:.3}; forces differ by {off:.1e} N",
+            method.name(),
+            ours / gcc
+        );
     }
 }
 

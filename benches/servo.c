@@ -102,3 +102,39 @@ void contact(double *state, const Params *params, double h, uint64_t count) {
     state[0] = z;
     state[1] = first + (double)count;
 }
+
+/* The contact alone with a speed for each step from an array, and the friction force after each step to another one. */
+static inline double rate(double v, double a, double z) {
+    return v - a * z;
+}
+
+static inline double steady(const Params *p, double v) {
+    double ratio = v / p->vs;
+    return p->sigma0 * fabs(v) / (p->Fc + (p->Fs - p->Fc) * exp(-(ratio * ratio)));
+}
+
+void contact_euler(double *state, const Params *params, double h, uint64_t count, const double *v, double *F) {
+    Params p = *params;
+    double z = *state;
+    for (uint64_t n = 0; n < count; n++) {
+        double a = steady(&p, v[n]);
+        z += h * rate(v[n], a, z);
+        F[n] = p.sigma0 * z + p.sigma1 * rate(v[n], a, z) + p.sigma2 * v[n];
+    }
+    *state = z;
+}
+
+void contact_rk4(double *state, const Params *params, double h, uint64_t count, const double *v, double *F) {
+    Params p = *params;
+    double z = *state;
+    for (uint64_t n = 0; n < count; n++) {
+        double a = steady(&p, v[n]);
+        double k1 = rate(v[n], a, z);
+        double k2 = rate(v[n], a, z + h / 2 * k1);
+        double k3 = rate(v[n], a, z + h / 2 * k2);
+        double k4 = rate(v[n], a, z + h * k3);
+        z += h / 6 * (k1 + 2 * (k2 + k3) + k4);
+        F[n] = p.sigma0 * z + p.sigma1 * rate(v[n], a, z) + p.sigma2 * v[n];
+    }
+    *state = z;
+}
