@@ -332,10 +332,17 @@ impl Checker<'_> {
     }
 
     /// Whether the definition of a quantity gives it its unit. A pure number may lack a unit that its uses tell: then it is
-    /// the number that is reported.
+    /// the number that is reported. An argument or a changed value has to fit what the model makes of the quantity, as a
+    /// use has.
     fn is_inferred_from_its_definition(&self, id: VarId) -> bool {
-        let values = values(self.system.var(id));
-        self.vars[id.0 as usize].is_inferred() && !values.into_iter().any(|value| self.is_bare(value))
+        let var = self.system.var(id);
+        let origin = match var.definition {
+            Definition::Value(_, origin) | Definition::Held { origin, .. } => origin,
+            _ => self.system.start_origin(id),
+        };
+        let is_of_the_model = matches!(origin, Origin::Equation(_) | Origin::Default);
+        let has_bare_value = || values(var).into_iter().any(|value| self.is_bare(value));
+        self.vars[id.0 as usize].is_inferred() && is_of_the_model && !has_bare_value()
     }
 
     // ---- nodes
@@ -1303,26 +1310,28 @@ mod tests {
     /// definition.
     #[test]
     fn a_use_with_a_wrong_unit_is_blamed_at_the_use() {
-        let mut kinds = [0; 6];
+        let mut kinds = [0; 7];
         for seed in 1..=600 {
             let mut random = Random(seed);
-            let (inner, names, outputs) = lines(&mut random);
+            let (mut inner, names, outputs) = lines(&mut random);
+            inner.extend(["param bare = 3".into(), "let its_use = 1 + bare * 2".into()]);
             let kind = random.below(kinds.len());
-            let name = if kind < 5 { &names } else { &outputs };
+            let name = if kind == 5 { &outputs } else { &names };
             if name.is_empty() {
                 continue;
             }
             let name = &name[random.below(name.len())];
-            let (mut expect, mut own) = (String::new(), None);
+            let (mut expect, mut run, mut own) = (String::new(), "() for 1 s", None);
             match kind {
                 0 => own = Some(format!("let wrong = {name} + 1 kg^5·m^7")),
                 1 => own = Some(format!("output wrong [kg^5·m^7] = {name}")),
                 2 => own = Some(format!("require max({name}, 1 kg^5·m^7) > 0 * {name}  // wrong")),
                 3 => own = Some(format!("part wrong = Taker(v = {name})")),
                 4 => own = Some(format!("let wrong = if {name} > 1 kg^5·m^7 then 1 else 2")),
-                _ => expect = format!("  expect max({name}) > 1 kg^5·m^7  // wrong\n"),
+                5 => expect = format!("  expect max({name}) > 1 kg^5·m^7  // wrong\n"),
+                _ => run = "(bare = 1 kg^5·m^7) for 1 s  // wrong",
             }
-            let text = |own: Option<&String>, expect: &str, random: &mut Random| {
+            let text = |own: Option<&String>, (run, expect): (&str, &str), random: &mut Random| {
                 let mut lines: Vec<&String> = inner.iter().collect();
                 lines.extend(own);
                 for last in (1..lines.len()).rev() {
@@ -1331,13 +1340,13 @@ mod tests {
                 let lines: String = lines.iter().map(|line| format!("  {line}\n")).collect();
                 format!(
                     "model Taker {{\n  input v [kg^5·m^7]\n  output w [1] = v / 1 kg^5·m^7\n}}\nmodel Inner {{\n{lines}}}\n\
-                     experiment it {{\n  run Inner() for 1 s\n{expect}}}\n"
+                     experiment it {{\n  run Inner{run}\n{expect}}}\n"
                 )
             };
             let order = random.clone();
-            let right = text(None, "", &mut order.clone());
+            let right = text(None, ("() for 1 s", ""), &mut order.clone());
             assert_eq!(blamed(&right), [""; 0], "seed {seed}\n{right}");
-            let wrong = text(own.as_ref(), &expect, &mut order.clone());
+            let wrong = text(own.as_ref(), (run, &expect), &mut order.clone());
             let found = blamed(&wrong);
             assert!(
                 !found.is_empty() && found.iter().all(|found| found.contains("wrong")),
