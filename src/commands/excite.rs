@@ -7,7 +7,8 @@
 use super::fit::search::Runs;
 use super::{End, load, load_text, reported, sound};
 use crate::args;
-use crate::compile::{self, ElementaryFunction, Loaded, Options, Sources, Stopwatch, Unary};
+use crate::compile::{self, ElementaryFunction, Loaded, Options, Stopwatch, Unary};
+use crate::disk::WithTable;
 use crate::project;
 use crate::quantity::{self, count, duration, show, significant};
 use crate::terminal::{Style, Terminal};
@@ -38,8 +39,8 @@ const INSTANTS: usize = 64;
 const LEAST_SENSITIVITY: f64 = 4.0;
 /// Criterion of a motion that cannot be run.
 const FAILED: f64 = 1e9;
-/// Most sizes of a motion that are tried for limits of quantities that only a run tells, and the part of a limit that
-/// is near enough.
+/// Most sizes of a motion that are tried for limits of quantities that follow from runs, and the part of a limit that is
+/// near enough.
 const MOST_SCALINGS: usize = 12;
 const NEAR_LIMIT: f64 = 0.99;
 /// Most rows of a design.
@@ -186,6 +187,11 @@ impl Limit {
         format!("{low} .. {high}")
     }
 
+    /// The part of it that the least and the greatest value reach.
+    fn share(&self, (low, high): (f64, f64)) -> f64 {
+        (high / self.high).max(low / self.low)
+    }
+
     fn read(text: &str) -> Result<Limit, String> {
         let wrong = || format!("--limit: `{text}` is none; write it as 'x = -2 mm .. 2 mm'");
         let (name, range) = text.split_once('=').ok_or_else(wrong)?;
@@ -205,31 +211,8 @@ impl Limit {
     }
 }
 
-/// Texts on disk, and the table of times that the design runs over.
-struct Designed {
-    table: String,
-}
-
-/// The name of that table.
+/// The name of the table of times that the design runs over.
 const TABLE: &str = "(design).csv";
-
-impl Sources for Designed {
-    fn library(&self, module: &str) -> Option<Vec<(String, String)>> {
-        crate::disk::Disk.library(module)
-    }
-
-    fn modules(&self) -> Vec<String> {
-        crate::disk::Disk.modules()
-    }
-
-    fn library_is_sound(&self) -> bool {
-        crate::disk::Disk.library_is_sound()
-    }
-
-    fn file(&self, from: &str, path: &str) -> Result<(String, String), String> {
-        if path == TABLE { Ok((TABLE.into(), self.table.clone())) } else { crate::disk::Disk.file(from, path) }
-    }
-}
 
 /// A fit whose motion is designed.
 struct Design {
@@ -240,7 +223,7 @@ struct Design {
     moves: Moves,
     /// Limits of what moves.
     limits: Vec<Limit>,
-    /// Limits of other quantities, each with its slot: only a run tells whether a motion keeps them.
+    /// Limits of other quantities, each with its slot: whether a motion keeps them follows from its runs.
     watched: Vec<(Limit, Slot)>,
     /// Instants at which limits are checked: position, speed and acceleration there for each coefficient alone.
     shapes: Vec<Vec<[f64; 3]>>,
@@ -310,14 +293,14 @@ impl Design {
 
     /// The part of their limits that watched quantities reach for some motions; infinite where a run fails.
     fn shares(&self, motions: &[Vec<f64>], sets: &[Vec<f64>]) -> Vec<f64> {
-        let of = |(limit, (low, high)): (&Limit, &(f64, f64))| (high / limit.high).max(low / limit.low);
-        let limits = || self.watched.iter().map(|(limit, _)| limit);
-        let most = |all: Vec<(f64, f64)>| limits().zip(&all).map(of).fold(0.0, f64::max);
+        let most = |all: Vec<(f64, f64)>| {
+            self.watched.iter().zip(all).map(|((limit, _), reached)| limit.share(reached)).fold(0.0, f64::max)
+        };
         self.extremes(motions, sets).into_iter().map(|one| one.map_or(f64::INFINITY, most)).collect()
     }
 
     /// Motions, each made smaller until the watched quantities keep their limits for all sets of values, by secant and
-    /// bisection in turn. What they are at rest they keep; see [`Design::leaves_at_rest`].
+    /// bisection in turn. At rest all keep them, which [`Design::leaves_at_rest`] checks before.
     fn kept(&self, motions: Vec<Vec<f64>>, sets: &[Vec<f64>]) -> Vec<Vec<f64>> {
         if self.watched.is_empty() || sets.is_empty() {
             return motions;
@@ -460,7 +443,7 @@ fn designed(args: &args::Excite, terminal: &mut Terminal) -> Result<End, (String
     for k in 0..=rows as usize {
         let _ = writeln!(table, "{:?}{}", k as f64 / args.rate, ";0".repeat(columns));
     }
-    let sources = Designed { table };
+    let sources = WithTable { path: TABLE, table };
     let place = args.file.display().to_string();
     let mut changed = load_text(&place, &text, &sources, terminal, &mut watch).ok_or_else(|| failed(""))?;
     let compiled = match compile::fit(&mut changed, &sources, &name, &Options::default(), &mut Vec::new()) {
@@ -932,7 +915,7 @@ impl Report<'_> {
         };
         let _ = writeln!(out, "  log det of the information {}{by_sine}", significant(Report::criterion(best), 3));
         for ((limit, _), (low, high)) in design.watched.iter().zip(self.reached) {
-            let binds = (high / limit.high).max(low / limit.low) >= NEAR_LIMIT;
+            let binds = limit.share((*low, *high)) >= NEAR_LIMIT;
             let [low, high] = [*low, *high].map(|end| show(end, &limit.unit, 3));
             let what = if binds { "the limit" } else { "not the limit; that of another quantity is met first" };
             let _ = writeln!(out, "  {} reaches {low} .. {high}: {what}", limit.name);

@@ -86,6 +86,11 @@ impl Noise {
         noise
     }
 
+    /// Whether large whitened residuals count by their size.
+    pub fn is_robust(&self) -> bool {
+        self.bound.is_finite()
+    }
+
     /// The rows between gaps, of so many.
     fn stretches(&self, rows: usize) -> Vec<Range<usize>> {
         let mut begin = 0;

@@ -204,7 +204,7 @@ pub fn misfit(runs: &Runs, (noise, residuals): (&[Noise], &Residuals), values: &
             Some(_) => square() + n * (with.log)(noise.innovation),
             // Of least squares the sum is the number of rows.
             None => {
-                let square = if noise.bound.is_finite() { square() } else { 0.0 };
+                let square = if noise.is_robust() { square() } else { 0.0 };
                 square + n * (with.log)((noise.variance * noise.innovation).max(f64::MIN_POSITIVE))
             }
         })
@@ -321,7 +321,7 @@ fn alone(runs: &Runs, answer: &Answer, values: &[f64], steps: &[f64]) -> Option<
     let noise: Vec<Noise> = answer.weights.iter().zip(&residuals).map(scaled).collect();
     let known: Vec<bool> = runs.parts.iter().flat_map(|part| &part.asks.items).map(|item| item.sd.is_some()).collect();
     let noise = noise.into_iter().zip(&answer.weights).zip(known);
-    let keeps = |old: &Noise, known: bool| known || old.bound.is_finite();
+    let keeps = |old: &Noise, known: bool| known || old.is_robust();
     let noise: Vec<Noise> =
         noise.map(|((new, old), known)| if keeps(old, known) { old.clone() } else { new }).collect();
     Some(misfit(runs, (&noise, &residuals), values))
@@ -465,7 +465,7 @@ pub fn remarks(part: &Part, answer: &Answer, items: std::ops::Range<usize>) -> V
     let states: Vec<usize> = (0..names.len()).filter(|k| names[*k].0.starts_with("data.")).collect();
     let one = |(k, item): (usize, &crate::compile::FitItem)| {
         let (residuals, noise) = (&answer.residuals[k], &answer.noise[k]);
-        // Rows of the recording that have a residual, where others have none.
+        // The rows that have a residual; None where every row has one.
         let rows: Option<Vec<usize>> = (!is_whole || item.thin.is_some()).then(|| {
             let within: Vec<usize> = (0..part.asks.rows.len()).filter(is_within).collect();
             item.kept(&part.instants).into_iter().map(|row| within[row]).collect()

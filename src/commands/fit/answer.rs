@@ -12,7 +12,7 @@ use grammar::diagnostic::Diagnostic;
 use runtime::fit::loss::deviation;
 use runtime::fit::ranking::Paired;
 use runtime::fit::statistics::{Dependence, gaps};
-use runtime::fit::{Answer, Combination, Ended};
+use runtime::fit::{Answer, Combination, Ended, Noise};
 use runtime::run::verdict::Verdict;
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
@@ -591,7 +591,7 @@ impl Fitted {
             "correlation": (0..n).map(row).collect::<Vec<_>>(),
             "undetermined": open,
             "no_noise": answer.misfits,
-            "robust": answer.noise.iter().any(|noise| noise.bound.is_finite()),
+            "robust": answer.noise.iter().any(Noise::is_robust),
             "chi_square": number(answer.chi_square),
             "degrees_of_freedom": number(answer.degrees),
             "rank": self.rank.as_ref().map(|rank| rank.rank),
@@ -639,7 +639,7 @@ fn change(open: &Combination, k: usize, unknown: &FitUnknown) -> Option<String> 
 
 /// The standard deviation of the residuals of a compared quantity by their median, where large ones count by their size.
 fn robust_deviation(answer: &Answer, k: usize) -> Option<f64> {
-    answer.noise[k].bound.is_finite().then(|| deviation(&answer.residuals[k]))
+    answer.noise[k].is_robust().then(|| deviation(&answer.residuals[k]))
 }
 
 fn rms(rows: &[f64]) -> f64 {
