@@ -74,7 +74,7 @@ const CONTACT: &str = "model Contact {
 }";
 
 type Hand = unsafe extern "C" fn(state: *mut f64, params: *const f64, h: f64, count: u64);
-/// The same with an array of inputs and one for outputs.
+/// The same, with an array of inputs and an array for outputs.
 type Rowwise = unsafe extern "C" fn(
     state: *mut f64,
     params: *const f64,

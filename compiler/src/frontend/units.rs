@@ -331,9 +331,8 @@ impl Checker<'_> {
         }
     }
 
-    /// Whether the definition of a quantity gives it its unit. A pure number may lack a unit that its uses tell: then it is
-    /// the number that is reported. An argument or a changed value has to fit what the model makes of the quantity, as a
-    /// use has.
+    /// Whether the definition of a quantity gives it its unit. A pure number may lack the unit that its uses imply:
+    /// then the number is reported. An argument or a changed value is checked against the model, as a use is.
     fn is_inferred_from_its_definition(&self, id: VarId) -> bool {
         let var = self.system.var(id);
         let origin = match var.definition {
@@ -879,7 +878,7 @@ impl Checker<'_> {
                 self.mismatch(bound, &found, &wanted.clone());
             }
         }
-        // Its uses would be reported for the same mistake.
+        // Otherwise its uses would be reported as well, for the same mistake.
         if self.diagnostics.len() > reported && kind.is_inferred() {
             self.vars[id.0 as usize] = NodeType::Unknown;
         }
