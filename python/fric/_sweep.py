@@ -645,7 +645,7 @@ class _Client:
         self.each = self.rows.rows_a_file
         self.put = lambda hash: self.rows.adopt(hash.decode())
 
-    def size(self) -> int:
+    def size(self, slots: int) -> int:
         """Runs of the next unit."""
         if self.each:
             return self.each
@@ -653,14 +653,15 @@ class _Client:
             return self.fewest
         size = self.seconds / max(statistics.median(self.costs), 1e-9)
         # The last units are smaller, so that all workers end at about the same time.
-        left = (self.rows.items - self.unsent) / (2 * self.engine.slots())
+        left = (self.rows.items - self.unsent) / (2 * slots)
         return max(self.fewest, int(min(size, left)))
 
     def send(self) -> None:
         """Sends what may be out: two units for each slot."""
         if any(deaths > 1 for _, _, deaths in self.sent.values()):
             return
-        while len(self.sent) < 2 * self.engine.slots():
+        slots = self.asked(self.engine.slots)
+        while len(self.sent) < 2 * slots:
             if self.again:
                 # Dask blames all units that were queued on a dead worker: one that was there twice is sent alone.
                 alone = self.again[0][2] > 1
@@ -668,17 +669,25 @@ class _Client:
                     return
                 first, last, deaths = heapq.heappop(self.again)
                 if alone:
-                    self.sent[self.engine.send(self.plan, first, last)] = first, last, deaths
+                    self.sent[self.asked(self.engine.send, self.plan, first, last)] = first, last, deaths
                     return
             elif self.unsent < self.rows.items and sum(len(one) for _, one in self.waiting.values()) < MOST_WAITING:
                 # Without a known cost a few runs for each slot are enough.
-                if not self.costs and len(self.sent) >= self.engine.slots():
+                if not self.costs and len(self.sent) >= slots:
                     return
                 first, deaths = self.unsent, 0
-                last = self.unsent = min(self.rows.items, first + self.size())
+                last = self.unsent = min(self.rows.items, first + self.size(slots))
             else:
                 return
-            self.sent[self.engine.send(self.plan, first, last)] = first, last, deaths
+            self.sent[self.asked(self.engine.send, self.plan, first, last)] = first, last, deaths
+
+    def asked(self, call: Any, *arguments: Any) -> Any:
+        """What a call of the engine returns. A broken pool or a cluster out of reach may raise here before any unit does."""
+        try:
+            return call(*arguments)
+        except Exception as error:
+            why = str(error) or type(error).__name__
+            raise self.kept(f"the engine takes no more units: {why}") from error
 
     def kept(self, why: str) -> SweepError:
         """The error that ends a sweep, which can be resumed."""
@@ -759,7 +768,7 @@ class _Client:
             self.send()
             if not self.sent:
                 break
-            for future in self.engine.wait(0.5):
+            for future in self.asked(self.engine.wait, 0.5):
                 self.take(future)
             lost = self.engine.lost()
             if lost:

@@ -218,6 +218,33 @@ def test_a_broken_pool_ends_a_sweep_that_another_engine_finishes(command, folder
     assert out.read_bytes() == whole
 
 
+class Failing(concurrent.futures.ThreadPoolExecutor):
+    """Takes some units, and none from then on."""
+
+    def __init__(self, takes):
+        super().__init__(2)
+        self.takes = takes
+
+    def submit(self, *arguments):
+        self.takes -= 1
+        if self.takes < 0:
+            raise concurrent.futures.BrokenExecutor("out of order")
+        return super().submit(*arguments)
+
+
+@pytest.mark.parametrize("takes", [0, 1, 2, *(random.Random(seed).randrange(3, 12) for seed in range(4))])
+def test_an_engine_that_takes_no_more_units_keeps_the_rows(command, folder, takes):
+    runs = 400
+    whole = alone(command, folder, runs)
+    out = folder / "t.csv"
+    with Failing(takes) as pool, pytest.raises(fric.SweepError, match="no more units: out of order.*resume=True") as raised:
+        sweep(folder, runs, out=out, on=pool, unit=0.001)
+    first, last = raised.value.missing[0]
+    assert 0 <= first < last == 5 * runs
+    sweep(folder, runs, out=out, resume=True)
+    assert out.read_bytes() == whole
+
+
 def test_statistics_alone_and_beside_rows_are_those_of_the_command(command, folder):
     runs = 700
     table = alone(command, folder, runs, "alone.csv", "--keep", "both")
