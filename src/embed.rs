@@ -3,6 +3,8 @@
 //! In: a text and its name. Out: runs with the results of `fric run --json`, programs of models, reports on mistakes as
 //! strings. Files that a text names are read once, so that the text can be sent elsewhere together with them.
 
+mod fits;
+
 pub use crate::args::Keep;
 use crate::characterise::subject::Written;
 use crate::characterise::{Extent, page, study};
@@ -27,6 +29,9 @@ use runtime::record::Recording;
 use std::path::Path;
 use std::sync::Arc;
 use std::time::Instant;
+
+pub use crate::commands::fit::conclusion::Wishes as FitWishes;
+pub use fits::{Compared, Fit, FoundFit, Unknown, laws, ranked};
 
 /// What is wrong with a text or with what was asked of it.
 #[derive(Clone, Debug)]

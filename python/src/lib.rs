@@ -8,6 +8,7 @@ mod raise;
 mod arrays;
 mod arrow;
 mod watched;
+mod fit;
 mod text;
 mod native;
 mod stepper;
@@ -32,6 +33,8 @@ mod _fric {
     #[pymodule_export]
     use crate::batch::Batch;
     #[pymodule_export]
+    use crate::fit::{Fit, Found};
+    #[pymodule_export]
     use crate::native::Native;
     #[pymodule_export]
     use crate::stepper::Stepper;
@@ -43,6 +46,13 @@ mod _fric {
     use numpy::PyArrayMethods;
     use pyo3::exceptions::PyValueError;
     use pyo3::prelude::*;
+
+    /// The file at a path as CSV text, and the text of a fit of each standard law to it, which names it by this path.
+    #[pyfunction]
+    fn laws(py: Python, recording: &str, file: &str) -> PyResult<String> {
+        let made = crate::watched::guarded(py, || py.detach(|| fric::embed::laws(recording, file)))?;
+        made.map_err(PyValueError::new_err)
+    }
 
     /// Runs the command with these arguments, the name of the program first; returns the exit code.
     #[pyfunction]

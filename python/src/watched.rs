@@ -5,6 +5,7 @@ use pyo3::prelude::*;
 use runtime::engine::Continue;
 use std::cell::{Cell, RefCell};
 use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::mpsc::{RecvTimeoutError, channel};
 use std::time::{Duration, Instant};
@@ -14,14 +15,14 @@ const LOOK: Duration = Duration::from_millis(20);
 
 /// What a worker reports and asks.
 pub struct Progress {
-    stop: AtomicBool,
+    stop: Arc<AtomicBool>,
     /// The fraction done, as bits.
     done: AtomicU64,
 }
 
 impl Progress {
     /// Set when the work must stop.
-    pub fn stop(&self) -> &AtomicBool {
+    pub fn stop(&self) -> &Arc<AtomicBool> {
         &self.stop
     }
 
@@ -39,7 +40,7 @@ pub fn watched<T: Send>(
     progress: Option<&Bound<PyAny>>,
     work: impl FnOnce(&Progress) -> T + Send,
 ) -> PyResult<T> {
-    let state = Progress { stop: AtomicBool::new(false), done: AtomicU64::new(0f64.to_bits()) };
+    let state = Progress { stop: Arc::new(AtomicBool::new(false)), done: AtomicU64::new(0f64.to_bits()) };
     let progress = progress.map(|progress| progress.clone().unbind());
     let (mut raised, mut result) = (None, None);
     py.detach(|| {

@@ -7,35 +7,27 @@ mod kept;
 pub mod search;
 #[cfg(test)]
 mod differences;
-mod after;
-mod answer;
+pub mod after;
+pub mod answer;
 mod page;
-mod laws;
-mod rank;
+pub mod conclusion;
+pub mod laws;
+pub mod rank;
 mod text;
 mod of_laws;
 
-use super::{End, load, reported, sound, sweep};
+use super::{End, load, reported, sound};
 use crate::args;
-use crate::commands::fit::answer::Fitted;
+use crate::commands::fit::conclusion::{Asked, Conclusion, Wishes, judged, own, told};
 use crate::commands::fit::kept::{Keeping, Kept};
-use crate::commands::fit::search::{Found, Part, Runs, Settings, search, search_from};
-use crate::compile::{self, Asks, Changes, Loaded, Options, Stopwatch};
-use crate::figure::{self, Recorded};
-use crate::plot::{self, Kind, Look};
-use crate::project;
-use crate::quantity::{count, show};
+use crate::commands::fit::search::{Found, Runs, Settings, search};
+use crate::compile::{self, Changes, Loaded, Options, Stopwatch};
 use crate::recording_files::Format;
 use crate::results;
 use crate::terminal::{Style, Terminal};
-use abi::plan::Experiment;
 use grammar::ast::{ExperimentStatement, FitStatement};
-use grammar::diagnostic::Diagnostic;
-use runtime::engine::{self, Continue, Failure};
 use runtime::fit::{Trouble, Way};
-use runtime::package;
 use runtime::run::verdict::Verdict;
-use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
@@ -158,7 +150,7 @@ fn one(
     if args.check {
         return check(args, &runs, loaded, name, terminal);
     }
-    if let Some(unknown) = unknown_profile(args, &runs) {
+    if let Some(unknown) = Wishes::of(args).unknown_profile(&runs) {
         terminal.error(&format!("--profile: fit `{name}` does not vary `{unknown}`"));
         return End::Misused;
     }
@@ -170,8 +162,9 @@ fn one(
         }
     };
     let seconds = begin.elapsed().as_secs_f64();
-    let question = Asked { args, file: &args.file, data: &options.changes.data, loaded, name, rank: None };
-    conclude(&question, &runs, found, seconds, terminal)
+    let recordings = conclusion::recordings(&args.file, &runs, !options.changes.data.is_empty());
+    let question = Asked { loaded, file: &args.file, name, recordings: &recordings };
+    conclude(args, &question, &runs, found, (None, seconds), terminal)
 }
 
 /// Fits each alternative of a fit, ranks them, and shows the best.
@@ -208,77 +201,31 @@ fn alternatives(
     rank::rank(args, &heading, (&args.file, &options.changes.data), loaded, &tried, terminal)
 }
 
-/// A fit that has been searched for.
-struct Asked<'a> {
-    args: &'a args::Fit,
-    /// The text with the fit.
-    file: &'a Path,
-    /// The recordings in place of the text's own.
-    data: &'a [String],
-    loaded: &'a Loaded,
-    name: &'a str,
-    /// Its place among several laws.
-    rank: Option<&'a answer::Rank>,
-}
-
 /// Shows the answer of a fit and writes its files.
-fn conclude(question: &Asked, runs: &Runs, found: Found, seconds: f64, terminal: &mut Terminal) -> End {
-    let Asked { args, file, data, loaded, name, rank } = *question;
-    let begin = Instant::now();
-    let settings = Settings::of(args);
-    let (found, profiles) = profiled(args, runs, found, settings);
-    let pieces = after::pieces(runs, &found, settings, args.pieces);
-    let validated = after::judge(runs, &found, settings);
-    let (answer, steps, coarse) = found;
-    let mut fitted = Fitted::new(name, runs, answer, &steps, args.level, seconds + begin.elapsed().as_secs_f64());
-    (fitted.profiles, fitted.pieces) = (profiles, pieces);
-    for (one, runs) in validated.into_iter().zip(&runs.judged) {
-        match one {
-            Ok(one) => fitted.judged.push(one),
-            Err(why) => fitted.notes.push(format!("{} cannot be judged: {why}", runs.parts[0].asks.label)),
+fn conclude(
+    args: &args::Fit,
+    question: &Asked,
+    runs: &Runs,
+    found: Found,
+    (rank, seconds): (Option<&answer::Rank>, f64),
+    terminal: &mut Terminal,
+) -> End {
+    let name = question.name;
+    let concluded = match Conclusion::new(name, runs, found, &Wishes::of(args), rank, seconds) {
+        Ok(concluded) => concluded,
+        Err(why) => {
+            terminal.error(&why);
+            return End::Failed;
         }
-    }
-    fitted.coarse = coarse;
-    fitted.rank = rank.cloned();
-    let mut outcomes = Vec::new();
-    for ((part, step), items) in runs.parts.iter().zip(&steps).zip(runs.items()) {
-        let values = &fitted.answer.values;
-        let of = if runs.parts.len() > 1 { format!("{}: ", part.asks.label) } else { String::new() };
-        match judged(part, values, *step) {
-            Ok((outcome, left)) => {
-                fitted.notes.extend(left.map(|left| format!("{of}{left}")));
-                outcomes.push(outcome);
-            }
-            Err(failure) => {
-                terminal.error(&format!("{name}: {of}the fitted run stops: {failure}"));
-                return End::Failed;
-            }
-        }
-        let on = Fitted::step_on(part, *step);
-        fitted.runs.push(answer::Run {
-            verdicts: own(part, &outcomes[outcomes.len() - 1]).to_vec(),
-            measures: part.measures(values, on),
-            unsettled: if part.asks.steady { part.unsettled(values, &fitted.answer.rms[items]) } else { 0 },
-            solver: part.solver(on),
-            step: *step,
-            remarks: after::remarks(part, &fitted.answer, runs.items()[fitted.runs.len()].clone()),
-        });
-    }
-    let warnings = fitted.warnings(runs);
-    let statement = compile::find_fit(loaded, name).expect("it has been fitted");
-    let recordings: Vec<(PathBuf, String)> =
-        runs.parts.iter().map(|part| recording(file, &part.asks, !data.is_empty())).collect();
+    };
     if args.json {
-        terminal.line(&fitted.json(file, runs, &recordings).to_string());
+        terminal.line(&concluded.json(question, runs).to_string());
     } else {
         if !args.quiet {
             terminal.line(&terminal.styled(Style::Bold, name));
-            terminal.print(&fitted.words(runs, terminal));
+            terminal.print(&concluded.fitted.words(runs, terminal));
         }
-        let place = text::Place { folder: &args.out, file, recordings: &recordings };
-        // A text on the standard input has no place from which another could import it.
-        let text = (!project::is_standard(file)).then(|| text::text(loaded, statement, &fitted, runs, &place));
-        match written(question, text, runs, &fitted, (&outcomes, &warnings), &recordings) {
+        match concluded.write(question, runs, &args.out, args.report) {
             Ok(paths) if !args.quiet => {
                 let paths: Vec<String> = paths.iter().map(|path| path.display().to_string()).collect();
                 terminal.line(&format!("  wrote {}", paths.join(", ")));
@@ -289,83 +236,16 @@ fn conclude(question: &Asked, runs: &Runs, found: Found, seconds: f64, terminal:
                 return End::Failed;
             }
         }
-        if !warnings.is_empty() && !args.quiet {
-            reported(loaded, &warnings, terminal);
+        if !concluded.warnings.is_empty() && !args.quiet {
+            reported(question.loaded, &concluded.warnings, terminal);
         }
     }
-    let failed: Vec<Verdict> =
-        fitted.runs.iter().flat_map(|run| &run.verdicts).filter(|verdict| !verdict.passed()).cloned().collect();
+    let failed = concluded.failed();
     if args.quiet && !failed.is_empty() {
         terminal.report(&format!("{name}\n{}", results::verdicts(terminal, &failed, None, None, "  ")));
     }
-    let bad = !failed.is_empty() || !fitted.converged() || args.strict && !warnings.is_empty();
-    if bad { End::Failed } else { End::Fine }
-}
-
-/// A path of `--profile` that the fit does not vary.
-fn unknown_profile<'a>(args: &'a args::Fit, runs: &Runs) -> Option<&'a str> {
-    let is_known = |path: &str| runs.unknowns.iter().any(|unknown| unknown.path == path || unknown.label == path);
-    args.profile.iter().map(String::as_str).find(|path| !matches!(*path, "all" | "none") && !is_known(path))
-}
-
-/// The profiles that are asked for, or that the answer needs. Where a profile meets a better answer, the search goes on
-/// from there, once.
-fn profiled(
-    args: &args::Fit,
-    runs: &Runs,
-    mut found: Found,
-    settings: Settings,
-) -> (Found, Vec<Option<after::Profile>>) {
-    let n = runs.unknowns.len();
-    let mut again = true;
-    'answer: loop {
-        let answer = &found.0;
-        let is_asked = |k: usize| {
-            let unknown = &runs.unknowns[k];
-            match &args.profile[..] {
-                [] => answer.at_bound[k].is_some() || after::is_open(answer, k),
-                [one] if one == "none" => false,
-                named => named.iter().any(|one| *one == "all" || *one == unknown.path || *one == unknown.label),
-            }
-        };
-        let mut profiles = Vec::new();
-        for k in 0..n {
-            profiles.push(match is_asked(k).then(|| after::profile(runs, &found, settings, k)) {
-                None => None,
-                Some(Ok(profile)) => Some(profile),
-                Some(Err(better)) => {
-                    if again && let Ok(next) = search_from(runs, &better, settings) {
-                        again = false;
-                        let (mut answer, steps, coarse) = next;
-                        answer.runs += found.0.runs;
-                        (answer.starts, answer.followed, answer.ends) =
-                            (found.0.starts, found.0.followed, found.0.ends.clone());
-                        found = (answer, steps, coarse);
-                        continue 'answer;
-                    }
-                    None
-                }
-            });
-        }
-        return (found, profiles);
-    }
-}
-
-/// The run with these values, and a range that it left.
-fn judged(part: &Part, values: &[f64], step: f64) -> Result<(engine::Outcome, Option<String>), Failure> {
-    let (instance, experiment) = part.with(values, step).expect("these values have been run");
-    let description = instance.description().clone();
-    let plots = part.varying.plots.clone();
-    let outcome = engine::run(instance, &Experiment { plots, ..experiment }, &mut |_| Continue::Continue(()))?;
-    let watched = &outcome.verdicts[part.varying.expects()..];
-    let extremes: Vec<(f64, f64)> = watched.iter().map(sweep::extremes).collect();
-    let left = part.varying.left(&description, &extremes);
-    Ok((outcome, left))
-}
-
-/// The verdicts of a fit's own expectations. After them there are the compared measures, and those that watch ranges.
-fn own<'o>(part: &Part, outcome: &'o engine::Outcome) -> &'o [Verdict] {
-    &outcome.verdicts[..part.varying.expects() - part.slots.len()]
+    let warned = args.strict && !concluded.warnings.is_empty();
+    if !failed.is_empty() || !concluded.fitted.converged() || warned { End::Failed } else { End::Fine }
 }
 
 /// Whether a fit has expectations.
@@ -412,16 +292,6 @@ pub fn verdicts(loaded: &mut Loaded, name: &str, interpret: bool, terminal: &Ter
     Some(all)
 }
 
-/// The recording of a run and its SHA-256. `given`: it comes from the command line, with an absolute path.
-fn recording(file: &Path, asks: &Asks, given: bool) -> (PathBuf, String) {
-    let from = if given { String::new() } else { file.display().to_string() };
-    match project::bytes_named(&from, &asks.recording) {
-        Ok((path, bytes)) => (path, package::hash(&bytes)),
-        // It has been read before; now it is gone.
-        Err(_) => (PathBuf::from(&asks.recording), String::new()),
-    }
-}
-
 /// `--check`: the differences with the values as they are written.
 fn check(args: &args::Fit, runs: &Runs, loaded: &Loaded, name: &str, terminal: &mut Terminal) -> End {
     let starts: Vec<f64> = runs.unknowns.iter().map(|unknown| unknown.start).collect();
@@ -438,102 +308,4 @@ fn check(args: &args::Fit, runs: &Runs, loaded: &Loaded, name: &str, terminal: &
             End::Failed
         }
     }
-}
-
-/// What went wrong, as a diagnostic.
-fn told(trouble: &Trouble, runs: &Runs) -> Diagnostic {
-    let unknowns = &runs.unknowns;
-    match trouble {
-        Trouble::NoStart(why) => {
-            let starts: Vec<String> =
-                unknowns.iter().map(|one| format!("{} = {}", one.label, show(one.start, &one.unit, 4))).collect();
-            Diagnostic::error("E0907", format!("the fit cannot be run from any start: {why}"))
-                .label(runs.name, format!("not with {}", starts.join(", ")))
-                .help("give a start that can be run, as in `vary Fs = 1.5 N in 1 N .. 2 N`, or a smaller range")
-        }
-        Trouble::NoInfluence(idle) => {
-            let unknown = &unknowns[idle[0]];
-            let mut error = Diagnostic::error("E0906", format!("`{}` changes nothing that is compared", unknown.label));
-            for k in idle {
-                error = error.label(unknowns[*k].span, "no residual depends on it");
-            }
-            error.help("leave it out, compare something that it changes, or record a motion in which it acts")
-        }
-        Trouble::TooFewRows(rows, unknowns) => {
-            let error = Diagnostic::error("E0910", format!("{rows} rows cannot determine {unknowns} unknowns"));
-            error.label(runs.name, "too few rows").help("compare more rows, or vary fewer parameters")
-        }
-    }
-}
-
-/// Writes the files of a fit; returns their paths, or the one that failed and why.
-fn written(
-    question: &Asked,
-    text: Option<String>,
-    runs: &Runs,
-    fitted: &Fitted,
-    (outcomes, warnings): (&[engine::Outcome], &[Diagnostic]),
-    recordings: &[(PathBuf, String)],
-) -> Result<Vec<PathBuf>, (PathBuf, std::io::Error)> {
-    let mut paths = Vec::new();
-    let mut write = |path: PathBuf, content: &mut project::Content| {
-        project::write_by(&path, content).map_err(|error| (path.clone(), error))?;
-        paths.push(path);
-        Ok(())
-    };
-    let bytes = |bytes: Vec<u8>| move |out: &mut dyn Write| out.write_all(&bytes);
-    let (args, name) = (question.args, question.name);
-    let at = |stem: &str, ending: &str| args.out.join(format!("{stem}.{ending}"));
-    let mut shown = Vec::new();
-    if let Some(text) = text {
-        write(at(name, "fric"), &mut bytes(text.into_bytes()))?;
-    }
-    let json = format!("{:#}\n", fitted.json(question.file, runs, recordings));
-    write(at(name, "json"), &mut bytes(json.into_bytes()))?;
-    for (((part, run), outcome), items) in runs.parts.iter().zip(&fitted.runs).zip(outcomes).zip(runs.items()) {
-        let asks = &part.asks;
-        let stem = if runs.parts.len() > 1 { format!("{name}_{}", asks.label) } else { name.to_string() };
-        let mut slots = part.slots.clone();
-        slots.extend(asks.items.iter().flat_map(|item| item.sides.iter().flatten().map(|(_, slot)| *slot)));
-        let every = page::every(part.instants.len());
-        let mut rows = Vec::new();
-        let mut content = |out: &mut dyn Write| {
-            out.write_all(answer::heading(asks).as_bytes())?;
-            let mut row = 0;
-            let mut fault = None;
-            let mut each = |times: &[f64], values: &[f64]| {
-                let lines = answer::lines(asks, (row, times), values);
-                for (k, values) in values.chunks(slots.len()).enumerate().filter(|(k, _)| (row + k) % every == 0) {
-                    rows.push((row + k, values.to_vec()));
-                }
-                row += times.len();
-                out.write_all(lines.as_bytes()).map_err(|error| fault.insert(error).to_string())
-            };
-            let ran = part.sampled(&fitted.answer.values, run.step, (&part.instants, &slots), &mut each);
-            match (ran, fault) {
-                (Ok(()), _) => Ok(()),
-                (Err(_), Some(error)) => Err(error),
-                (Err(why), None) => Err(std::io::Error::other(why)),
-            }
-        };
-        write(at(&stem, "csv"), &mut content)?;
-        shown.push(page::PageRun { recording: &outcome.recording, rows });
-        let plots = &part.varying.plots;
-        if !plots.is_empty() {
-            let rms = asks.items.iter().zip(&fitted.answer.rms[items]);
-            let rms: Vec<String> = rms.map(|(item, rms)| show(*rms, &item.unit, 3)).collect();
-            let rows = count(asks.rows.len() as u64);
-            let subtitle = format!("{} fitted to {rows} rows, rms {}", asks.model, rms.join(", "));
-            let drawn = Recorded { label: "", plots, recording: &outcome.recording, verdicts: &[] };
-            let drawn = figure::figure(&stem, &subtitle, 0, &[drawn]);
-            write(at(&stem, "svg"), &mut bytes(plot::picture(&drawn, &Look::default(), Kind::Svg)))?;
-        }
-    }
-    if args.report {
-        let statement = compile::find_fit(question.loaded, name).expect("it has been fitted");
-        let text = question.loaded.files.slice(statement.span);
-        let page = page::report(fitted, runs, (name, text), warnings, &shown);
-        write(at(name, "html"), &mut bytes(page.into_bytes()))?;
-    }
-    Ok(paths)
 }

@@ -37,7 +37,7 @@ mod repl;
 mod replay;
 mod run;
 pub mod sweep;
-mod fit;
+pub mod fit;
 mod excite;
 mod test;
 

@@ -447,7 +447,7 @@ impl Fitted {
     }
 
     /// The standard deviation and the interval of an unknown, widened where it drifts.
-    fn spread(&self, k: usize, unknown: &FitUnknown) -> (f64, (f64, f64)) {
+    pub fn spread(&self, k: usize, unknown: &FitUnknown) -> (f64, (f64, f64)) {
         let (sd, (low, high)) = (self.answer.sd[k], self.answer.intervals[k]);
         let Some(found) = scatter(&self.pieces, k).filter(|found| found.drifts) else { return (sd, (low, high)) };
         let wide = (found.sd / (found.pieces as f64).sqrt()).max(sd);

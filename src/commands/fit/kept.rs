@@ -9,13 +9,12 @@ use crate::project;
 use crate::terminal::Terminal;
 use crate::unfinished::{Hash, Mark, Unfinished, begun_otherwise};
 use runtime::fit::{Journal, Stage};
-use std::cell::RefCell;
 use std::collections::VecDeque;
 use std::fmt::Write as _;
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, BufRead, BufReader, Write};
 use std::path::{Path, PathBuf};
-use std::rc::Rc;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 /// First line of a file.
 const HEADER: &[u8] = b"stages of fric fit\n";
@@ -57,8 +56,8 @@ impl<'a> Keeping<'a> {
 
     /// All fits have ended: their stages are of no further use.
     pub fn finish(self, terminal: &Terminal) {
-        for Kept(file) in self.all {
-            let (path, fault) = file.borrow_mut().finish();
+        for kept in self.all {
+            let (path, fault) = kept.stages().finish();
             if let Some(error) = fault {
                 terminal.report(&format!("the stages of a fit could not be kept in {}: {error}\n", path.display()));
             }
@@ -97,7 +96,7 @@ fn asked(args: &args::Fit, loaded: &Loaded, name: &str, compiled: &[compile::Fit
 
 /// The stages of a fit. Copies write to the same file.
 #[derive(Clone)]
-pub struct Kept(Rc<RefCell<Stages>>);
+pub struct Kept(Arc<Mutex<Stages>>);
 
 struct Stages {
     path: PathBuf,
@@ -112,6 +111,10 @@ struct Stages {
 }
 
 impl Kept {
+    fn stages(&self) -> MutexGuard<'_, Stages> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
     fn begin(path: &Path, asked: &str, resume: bool, terminal: &Terminal) -> Result<Option<Kept>, String> {
         let told = |error: io::Error| format!("cannot keep the stages of a fit in {}: {error}", path.display());
         project::make_folder_of(path).map_err(told)?;
@@ -123,7 +126,7 @@ impl Kept {
         let made = |unfinished, file, mark, earlier| {
             let path = path.to_path_buf();
             let unfinished = Some(unfinished);
-            Ok(Some(Kept(Rc::new(RefCell::new(Stages { path, unfinished, file, mark, earlier, fault: None })))))
+            Ok(Some(Kept(Arc::new(Mutex::new(Stages { path, unfinished, file, mark, earlier, fault: None })))))
         };
         let start = Mark::after(HEADER);
         let before = unfinished.before().map(str::to_string).filter(|_| resume);
@@ -163,11 +166,11 @@ impl Stages {
 
 impl Journal for Kept {
     fn next(&mut self) -> Option<Stage> {
-        self.0.borrow_mut().earlier.pop_front()
+        self.stages().earlier.pop_front()
     }
 
     fn note(&mut self, stage: &Stage) {
-        let stages = &mut *self.0.borrow_mut();
+        let stages = &mut *self.stages();
         let Some(unfinished) = stages.unfinished.as_mut().filter(|_| stages.fault.is_none()) else { return };
         let line = line(stage);
         stages.mark = stages.mark.and(line.as_bytes());

@@ -4,8 +4,9 @@
 //! law has not seen.
 
 use super::answer::Rank;
+use super::conclusion::{Asked, recordings, told};
 use super::search::{Found, Runs};
-use super::{Asked, after, conclude, told};
+use super::{after, conclude};
 use crate::args;
 use crate::commands::{End, reported};
 use crate::compile::{ElementaryFunction, Loaded};
@@ -49,18 +50,7 @@ pub fn rank(
     tried: &[Tried],
     terminal: &mut Terminal,
 ) -> End {
-    let steady = tried.first().is_some_and(|one| one.runs.parts[0].asks.steady);
-    let contenders = contenders(tried);
-    let order = ranking::ranks(&contenders, steady);
-    let ranked = |(at, (k, rank)): (usize, &(usize, usize))| {
-        let than_next = order.get(at + 1).and_then(|(next, _)| {
-            let paired = ranking::paired(&contenders[*k], &contenders[*next], steady)?;
-            Some((tried[*next].law.clone(), paired))
-        });
-        let held_out = tried[*k].held_out.as_ref().map_or(f64::NAN, |rows| rms(&rows[0]));
-        (*k, Rank { rank: *rank, held_out, than_next })
-    };
-    let ranks: Vec<(usize, Rank)> = order.iter().enumerate().map(ranked).collect();
+    let ranks = order(tried);
     if !args.json && !args.quiet {
         terminal.print(&table(heading.title, tried, &ranks));
         if let Some(place) = heading.wrote {
@@ -74,9 +64,10 @@ pub fn rank(
         let Tried { name, runs, found, seconds, .. } = &tried[*k];
         match found {
             Ok(found) => {
-                let rank = Some(rank);
-                let question = Asked { args, file, data, loaded, name, rank };
-                if conclude(&question, runs, found.clone(), *seconds, terminal) != End::Fine && k == best {
+                let recordings = recordings(file, runs, !data.is_empty());
+                let question = Asked { loaded, file, name, recordings: &recordings };
+                let end_of_one = conclude(args, &question, runs, found.clone(), (Some(rank), *seconds), terminal);
+                if end_of_one != End::Fine && k == best {
                     end = End::Failed;
                 }
             }
@@ -87,6 +78,22 @@ pub fn rank(
         }
     }
     end
+}
+
+/// The laws in their order: the number of each, and its place.
+pub fn order(tried: &[Tried]) -> Vec<(usize, Rank)> {
+    let steady = tried.first().is_some_and(|one| one.runs.parts[0].asks.steady);
+    let contenders = contenders(tried);
+    let order = ranking::ranks(&contenders, steady);
+    let ranked = |(at, (k, rank)): (usize, &(usize, usize))| {
+        let than_next = order.get(at + 1).and_then(|(next, _)| {
+            let paired = ranking::paired(&contenders[*k], &contenders[*next], steady)?;
+            Some((tried[*next].law.clone(), paired))
+        });
+        let held_out = tried[*k].held_out.as_ref().map_or(f64::NAN, |rows| rms(&rows[0]));
+        (*k, Rank { rank: *rank, held_out, than_next })
+    };
+    order.iter().enumerate().map(ranked).collect()
 }
 
 /// The laws as they are ranked: residuals of several quantities count in units of those of the first law.

@@ -17,6 +17,7 @@ use runtime::fit::{
 };
 use std::ops::Range;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 /// Rows of all runs that are in memory at once.
 const TILE: usize = 65_536;
@@ -55,6 +56,8 @@ pub struct Runs {
 pub struct Part {
     /// Threads that share the runs.
     threads: usize,
+    /// Set when nobody waits for the answer any more: all runs fail then, and a search ends soon.
+    stop: Option<Arc<AtomicBool>>,
     /// Runs under other values.
     pub varying: Varying,
     /// What is asked.
@@ -108,7 +111,7 @@ impl Part {
             false => asks.rows.iter().copied().filter(is_within).collect(),
         };
         let slots = asks.items.iter().map(|item| item.slot).collect();
-        Part { threads, varying, asks, instants, slots, held }
+        Part { threads, stop: None, varying, asks, instants, slots, held }
     }
 
     /// Whether its steps follow from a tolerance.
@@ -272,6 +275,9 @@ impl Part {
         let is_filtered = self.asks.items.iter().any(|item| item.thin.is_some());
         let rows = if is_filtered { instants.len() } else { TILE };
         for _ in instants.chunks(rows.max(1)) {
+            if self.stop.as_ref().is_some_and(|stop| stop.load(Ordering::Relaxed)) {
+                return points.iter().map(|_| Err("it was stopped".into())).collect();
+            }
             let mut found: Vec<Option<Vec<Vec<f64>>>> = different.iter().map(|_| None).collect();
             for (number, values) in numbers.iter().zip(tiles.next(rows)) {
                 if ended[*number].is_ok() {
@@ -360,6 +366,12 @@ impl Runs {
     pub fn keep(&mut self, kept: Option<Kept>) {
         self.judged.iter_mut().for_each(|judged| judged.keep(kept.clone()));
         self.kept = kept;
+    }
+
+    /// Lets all runs fail as soon as this is set.
+    pub fn stop_by(&mut self, stop: &Arc<AtomicBool>) {
+        self.judged.iter_mut().for_each(|judged| judged.stop_by(stop));
+        self.parts.iter_mut().for_each(|part| part.stop = Some(stop.clone()));
     }
 
     /// The steps as the text has them; of adaptive runs their tolerances.
