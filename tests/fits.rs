@@ -15,8 +15,12 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 /// A folder for one test, empty at its start.
+fn folder_of(name: &str) -> PathBuf {
+    Path::new(env!("CARGO_TARGET_TMPDIR")).join("fits").join(name)
+}
+
 fn folder(name: &str) -> PathBuf {
-    let path = Path::new(env!("CARGO_TARGET_TMPDIR")).join("fits").join(name);
+    let path = folder_of(name);
     let _ = fs::remove_dir_all(&path);
     fs::create_dir_all(&path).unwrap();
     path
@@ -304,6 +308,20 @@ fn steady_points_are_fitted_at_the_steady_state_in_any_order() {
         }
         let shuffled = fitted("shuffled", &of_curve("StribeckGauss", "Fv"), &rows.concat());
         assert_eq!(shuffled["parameters"], still["parameters"], "seed {seed}");
+        // The table names each point by its row in the file.
+        let (why, code) = said("shuffled", &of_curve("StribeckGauss", "Fv"), &rows.concat(), &[]);
+        assert_eq!(code, 0, "{why}");
+        let table = fs::read_to_string(folder_of("shuffled").join("out/f.csv")).unwrap();
+        let mut named: Vec<usize> = Vec::new();
+        for line in table.lines().skip(1) {
+            let cells: Vec<&str> = line.split(',').collect();
+            let (point, force): (usize, f64) = (cells[0].parse().unwrap(), cells[cells.len() - 1].parse().unwrap());
+            let recorded: f64 = rows[point - 1].trim().split(',').nth(1).unwrap().parse().unwrap();
+            assert!((force - recorded).abs() < 1e-12, "seed {seed}: point {point} in {table}");
+            named.push(point);
+        }
+        named.sort_unstable();
+        assert_eq!(named, (1..=rows.len()).collect::<Vec<_>>(), "seed {seed}");
     }
 }
 

@@ -127,8 +127,8 @@ pub struct Variant {
     pub rows: Arc<[f64]>,
     /// Of a fit: the time of the first row in the file, in s.
     pub begins: f64,
-    /// Of a fit: its recording has no times; each row is a steady point.
-    pub steady: bool,
+    /// Of a fit whose recording has no times: the row in the file of each steady point.
+    pub points: Option<Arc<[usize]>>,
     /// Of a fit: the run can be held to its recording, and is where the changes say so.
     pub held: bool,
     /// Parameters that its panel may turn, in this order; all if there are none.
@@ -265,9 +265,11 @@ pub fn read(
         return Err(diagnostics);
     }
     let (mut rows, mut begins): (Arc<[f64]>, f64) = (Arc::from([]), 0.0);
+    let mut points: Option<Arc<[usize]>> = None;
     if let (Some(fit), Some((_, first, _))) = (fit, data.first()) {
         if steady {
-            rows = of_fit::hold(&mut data).into();
+            let (times, order) = of_fit::hold(&mut data);
+            (rows, points) = (times.into(), Some(order.into()));
         } else {
             begins = first.x.first().copied().unwrap_or(0.0);
             rows = match of_fit::interval(&first.x) {
@@ -350,7 +352,7 @@ pub fn read(
             warnings,
             on_stage,
         ) {
-            Ok(variant) => variants.push(Variant { rows: rows.clone(), begins, steady, ..variant }),
+            Ok(variant) => variants.push(Variant { rows: rows.clone(), begins, points: points.clone(), ..variant }),
             Err(errors) => return Err(errors),
         }
     }
@@ -712,7 +714,7 @@ fn variant<'a>(
     });
     let outputs = ports.outputs.iter().zip(ports_at).map(|((path, _), at)| (path.clone(), slots[at]));
     let ports = (inputs.collect(), outputs.collect());
-    let (rows, begins, steady) = (Arc::from([]), 0.0, false);
+    let (rows, begins, points) = (Arc::from([]), 0.0, None);
     Ok(Variant {
         label,
         system,
@@ -725,7 +727,7 @@ fn variant<'a>(
         rig,
         rows,
         begins,
-        steady,
+        points,
         held,
         tuned,
     })

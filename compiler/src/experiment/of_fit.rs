@@ -258,9 +258,9 @@ pub const HELD: f64 = 1e4;
 const PASSAGE: f64 = 1.0;
 
 /// Makes steady points a recording over time: each is held until a model has settled, then the next, in rising order of
-/// the first column. Returns the instants at which they are compared, in s: the ends of the holds.
-pub fn hold(data: &mut [(String, Table, Unit)]) -> Vec<f64> {
-    let Some((_, first, _)) = data.first() else { return Vec::new() };
+/// the first column. Returns the instants at which they are compared, in s: the ends of the holds; and the row of each point.
+pub fn hold(data: &mut [(String, Table, Unit)]) -> (Vec<f64>, Vec<usize>) {
+    let Some((_, first, _)) = data.first() else { return (Vec::new(), Vec::new()) };
     let mut order: Vec<usize> = (0..first.y.len()).collect();
     order.sort_by(|a, b| first.y[*a].total_cmp(&first.y[*b]));
     let begins = |k: usize| k as f64 * (HELD + PASSAGE);
@@ -270,7 +270,7 @@ pub fn hold(data: &mut [(String, Table, Unit)]) -> Vec<f64> {
         table.x = x.clone();
         table.y = order.iter().flat_map(|k| [table.y[*k]; 2]).collect();
     }
-    (0..n).map(|k| begins(k) + HELD).collect()
+    ((0..n).map(|k| begins(k) + HELD).collect(), order)
 }
 
 /// The times at which the recorded inputs of a run have corners.

@@ -70,6 +70,8 @@ pub struct Asks {
     pub columns: Vec<(String, Unit, Arc<[f64]>)>,
     /// The rows are steady points, without time: each is held for [`of_fit::HELD`], and compared at the end.
     pub steady: bool,
+    /// The row in the file of each steady point, which are held in rising order of the first column.
+    pub points: Arc<[usize]>,
     /// Times at which the recorded inputs have corners, in s.
     pub corners: Arc<[f64]>,
     /// Time of the first row in the file, in s.
@@ -634,14 +636,14 @@ fn asks(
     let before = time(parts.minimise.before.as_ref(), f64::INFINITY)?;
     let rows = variant.rows.clone();
     let timed = [&parts.minimise.after, &parts.minimise.before, &parts.run.duration].into_iter().flatten().next();
-    if let Some(time) = timed.filter(|_| variant.steady) {
+    if let Some(time) = timed.filter(|_| variant.points.is_some()) {
         let error = Diagnostic::error("E0902", "steady points have no time").label(time.span, "a time");
         diagnostics.push(error.help("leave it out, or name the column of times `t`"));
     }
     let compared: Vec<f64> = rows.iter().copied().filter(|t| (after..=before).contains(t)).collect();
     let items = match compared.is_empty() {
         true => Vec::new(),
-        false => items(loaded, parts, plots.last()?, (&compared, variant.steady), diagnostics),
+        false => items(loaded, parts, plots.last()?, (&compared, variant.points.is_some()), diagnostics),
     };
     if compared.is_empty() {
         let end = rows.last().copied().unwrap_or(0.0);
@@ -658,9 +660,10 @@ fn asks(
         slots: Vec::new(),
         items,
         columns: columns(variant),
-        corners: of_fit::corners(&rows, variant.steady),
+        corners: of_fit::corners(&rows, variant.points.is_some()),
         rows,
-        steady: variant.steady,
+        steady: variant.points.is_some(),
+        points: variant.points.clone().unwrap_or_default(),
         begins: variant.begins,
         window: (after, before),
         driven: reads_recording(&parts.run.instance),
@@ -744,7 +747,7 @@ fn items(
 /// The columns of the recording beside time, with a value for each row.
 fn columns(variant: &Variant) -> Vec<(String, Unit, Arc<[f64]>)> {
     // A steady point is held from one time to another.
-    let every = if variant.steady { 2 } else { 1 };
+    let every = if variant.points.is_some() { 2 } else { 1 };
     let tables = variant.system.tables.iter().filter(|table| table.y.len() == every * variant.rows.len());
     let column = |table: &crate::frontend::system::Table| {
         let name = table.name.strip_prefix("data.").filter(|name| *name != "t")?;

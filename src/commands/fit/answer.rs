@@ -713,7 +713,7 @@ pub fn lines(asks: &Asks, (first, instants): (usize, &[f64]), values: &[f64]) ->
     let units: Vec<&Unit> = shown(asks).into_iter().map(|(_, unit)| unit).collect();
     let mut out = String::new();
     for (row, t) in instants.iter().enumerate() {
-        out += &if asks.steady { (first + row + 1).to_string() } else { abi::format::plain(*t) };
+        out += &if asks.steady { (asks.points[first + row] + 1).to_string() } else { abi::format::plain(*t) };
         for (value, unit) in values[row * units.len()..].iter().zip(&units) {
             out += ",";
             out += &abi::format::plain(unit.from_si(*value));
