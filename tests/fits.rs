@@ -325,6 +325,42 @@ fn steady_points_are_fitted_at_the_steady_state_in_any_order() {
     }
 }
 
+/// The value of an unknown that the text or the command gives is where its search starts, so its unit and its range count
+/// as those of any other argument.
+#[test]
+fn a_given_start_of_an_unknown_is_checked_like_any_value() {
+    let law = "model Slide {\n  input v [m/s]\n  param k [N·s/m] in 0.1 N·s/m .. 10 N·s/m\n  param c = 1 N in 0.1 N .. 10 N\n  param n [N] in -9 N .. 9 N\n  output F [N] = k * v + c * v / sqrt(v * v + 0.01 m^2/s^2) + n\n}\n";
+    let data = "v [m/s],F [N]\n1,3\n2,5\n-1,-3\n-2,-5\n3,7\n";
+    let values = [("2", true), ("2 m", true), ("2 N", false), ("2 N·s/m", false), ("20", true), ("20 N", false)];
+    let mut refused = 0;
+    for (path, unit) in [("k", "N·s/m"), ("c", "N"), ("n", "N")] {
+        for (value, never) in values {
+            let fits = value.ends_with(unit) && value.ends_with(&format!(" {unit}"));
+            let is_wrong = never || !fits || value.starts_with("20");
+            for by_command in [false, true] {
+                let given = |other: &str| match (other == path, by_command) {
+                    (true, false) => format!(", {other} = {value}"),
+                    _ => String::new(),
+                };
+                let text = format!(
+                    "{law}fit f {{\n  run Slide(v = data.v{}{}{})\n  data \"r.csv\" (v [m/s], F [N])\n  vary k in 0.1 N·s/m .. 10 N·s/m, c in 0.1 N .. 10 N, n in -9 N .. 9 N\n  minimise rms(F - data.F)\n}}\n",
+                    given("k"),
+                    given("c"),
+                    given("n")
+                );
+                let set = format!("{path}={value}");
+                let args: &[&str] = if by_command { &["--set", &set] } else { &[] };
+                let (why, code) = said("given", &text, data, args);
+                assert_eq!(code == 1, is_wrong, "{path} = {value}, by the command {by_command}: {why}");
+                let named = ["E0101", "E0103", "E0502", "E0501"].iter().any(|code| why.contains(code));
+                assert!(named || !is_wrong, "{path} = {value}, by the command {by_command}: {why}");
+                refused += u32::from(is_wrong);
+            }
+        }
+    }
+    assert!(refused > 20, "{refused}");
+}
+
 /// A mass on a belt slips and sticks without end, so it has no steady state.
 #[test]
 fn a_model_that_does_not_settle_is_named() {

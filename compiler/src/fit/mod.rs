@@ -21,7 +21,7 @@ use abi::description::Kind;
 use abi::plan::Plot;
 use abi::unit::{Dimension, Unit};
 use grammar::ast::{self, ExperimentStatement, Expr, FitStatement};
-use grammar::diagnostic::Diagnostic;
+use grammar::diagnostic::{Diagnostic, Label};
 use grammar::span::Span;
 use std::sync::Arc;
 
@@ -474,6 +474,10 @@ fn run(
     let first = experiment::read(loaded, sources, name, &changes, &mut first_warnings, &mut |_| ());
     // A parameter that is computed from others, or has no value, is assigned one, as in a sweep.
     let at = changes.part.alternative;
+    let is_written = |path: &String| {
+        let given = changes.set.iter().filter_map(|set| set.split('=').next()).any(|set| set.trim() == path);
+        given || parts.run.instance.args.iter().any(|arg| arg.name.text == *path)
+    };
     let missing: Vec<usize> = match &first {
         Ok(variants) => {
             let description = &variants[at].program.description;
@@ -483,7 +487,11 @@ fn run(
             };
             (0..paths.len()).filter(|k| is_open(&paths[*k])).collect()
         }
-        Err(_) => (0..paths.len()).collect(),
+        // Values that are written stay, and so do their mistakes.
+        Err(errors) if errors.iter().all(|error| error.code == "E0203") => {
+            (0..paths.len()).filter(|k| !is_written(&paths[*k])).collect()
+        }
+        Err(_) => Vec::new(),
     };
     let set: Vec<String> = missing
         .iter()
@@ -495,14 +503,23 @@ fn run(
             warnings.append(&mut first_warnings);
             variants
         }
+        Err(errors) if set.is_empty() => return Err(errors),
         first => {
-            changes.set.extend(set);
+            changes.set.extend(set.clone());
             // A long recording is in memory once.
             let as_written = first.err();
             match experiment::read(loaded, sources, name, &changes, warnings, &mut |_| ()) {
                 Ok(variants) => variants,
                 // The errors of the text as it is written, rather than of the values above.
-                Err(errors) => return Err(as_written.unwrap_or(errors)),
+                Err(errors) => {
+                    let is_ours = |label: &Label| {
+                        let file = loaded.files.get(label.span.file);
+                        file.name.starts_with("--") && set.iter().any(|set| *set == *file.text)
+                    };
+                    let of_text = |error: &&Diagnostic| !error.labels.iter().any(is_ours);
+                    let own: Vec<Diagnostic> = errors.iter().filter(of_text).cloned().collect();
+                    return Err(if own.is_empty() { as_written.unwrap_or(errors) } else { own });
+                }
             }
         }
     };
