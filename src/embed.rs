@@ -31,7 +31,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 pub use crate::commands::fit::conclusion::Wishes as FitWishes;
-pub use fits::{Compared, Fit, FoundFit, Unknown, laws, ranked};
+pub use fits::{Compared, Fit, FoundFit, Unknown, laws, ranked, table};
 
 /// What is wrong with a text or with what was asked of it.
 #[derive(Clone, Debug)]

@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from fric import _fric, _html, _values
+from fric import _fit, _fric, _html, _tables, _values
+from fric._fit import Fit, Residuals
 from fric.errors import Diagnostic, RunError, diagnostics, unknown
 
 Progress = Callable[[float, float], object]
@@ -153,6 +154,11 @@ class Text:
         return self._inner.experiments()
 
     @property
+    def fits(self) -> list[str]:
+        """Names of the fits."""
+        return self._inner.fits()
+
+    @property
     def warnings(self) -> list[Diagnostic]:
         """What ``fric check`` warns of."""
         return [one for one in diagnostics(self._inner.check()) if one.severity == "warning"]
@@ -232,8 +238,68 @@ class Text:
                 raise error
         return runs
 
+    def fit(self, name: str | None = None, **how: Any) -> Fit:
+        """Finds the parameters with which a model follows recordings, as ``fric fit`` does; the only fit if no name is given.
+
+        See :meth:`rank` for the options. A search without an answer raises FitError. Expectations that fail and warnings
+        raise nothing: look at ``passed``, ``converged`` and ``warnings``.
+        """
+        found = self.rank(*([] if name is None else [name]), **how)
+        if len(found) != 1:
+            raise ValueError(f"`{found[0].name}` has {len(found)} laws; use text.rank({found[0].name!r})")
+        return found[0]
+
+    def rank(
+        self,
+        *names: str,
+        data: Any = None,
+        set: Mapping[str, Any] | None = None,
+        starts: int | None = None,
+        seed: int = 0,
+        level: float = 0.95,
+        robust: bool = False,
+        profile: str | Sequence[str] | None = None,
+        pieces: int = 4,
+        solver: str | None = None,
+        step: str | float | None = None,
+        tol: float | None = None,
+        threads: int | None = None,
+    ) -> list[Fit]:
+        """Fits each law of a fit with a ``sweep``, or several fits, and ranks them by what they predict: the best first.
+
+        ``data``: recordings in place of the text's own, each a path, a mapping of headings to arrays (``{"t [s]": …,
+        "v [mm/s]": …}``), a table of pandas or polars, or a :class:`Run`; a list for several. Headings without a unit have
+        that of the text. All other options as on the command line. A law without an answer is a warning.
+        """
+        names = tuple(self._fit(name) for name in names or [None])
+        asked = _fit._asked(self, names[0], data, set, solver, step, tol, threads)
+        return _fit._found(self, names, asked, _fit._wished(starts, seed, level, robust, profile, pieces))
+
+    def residuals(
+        self,
+        name: str | None = None,
+        *,
+        data: Any = None,
+        set: Mapping[str, Any] | None = None,
+        solver: str | None = None,
+        step: str | float | None = None,
+        tol: float | None = None,
+        threads: int | None = None,
+    ) -> Residuals:
+        """Computed minus recorded as a function of the unknowns of a fit, compiled once: for other optimisers."""
+        name = self._fit(name)
+        return Residuals(self._inner.residuals(name, _fit._asked(self, name, data, set, solver, step, tol, threads)))
+
+    def _fit(self, name: str | None) -> str:
+        if name is None and len(self.fits) == 1:
+            return self.fits[0]
+        if name not in self.fits:
+            raise unknown("fit", name or "", self.fits)
+        return name
+
     def __repr__(self) -> str:
-        return f"<fric.Text {self.name}: models {', '.join(self.models)}; experiments {', '.join(self.experiments)}>"
+        all = {"models": self.models, "experiments": self.experiments, "fits": self.fits}
+        return f"<fric.Text {self.name}: {'; '.join(f'{what} ' + ', '.join(names) for what, names in all.items() if names)}>"
 
     def __reduce__(self) -> Any:
         from fric import _restore
@@ -431,15 +497,12 @@ class Model:
             # new one.
             jumps = [np.asarray(value[0], dtype=float) for value in given.values() if isinstance(value, tuple)]
             corners = np.unique(np.concatenate(jumps)).tolist() if hold else times.tolist()
-            heads = [f"c{k} [{self.inputs[path].si or '1'}]" for k, path in enumerate(columns)]
-            table = ";".join(["t [s]", *(head.replace(" [1]", "") for head in heads)])
-            lines = [table] + [
-                ";".join(map(repr, row)) for row in np.column_stack([times, *columns.values()]).tolist()
-            ]
+            units = [self.inputs[path].si for path in columns]
+            heads = ["t [s]", *(f"c{k} [{si}]" if si else f"c{k}" for k, si in enumerate(units))]
             file = f"{experiment}.csv"
             files = [one for one in files if one[:2] != (name, file)]
-            files.append((name, file, file, "\n".join(lines) + "\n"))
-            data = f"  data {json.dumps(file)} (t [s], {', '.join(head.replace(' [1]', '') for head in heads)})\n"
+            files.append((name, file, file, _tables.text(heads, [times, *columns.values()])))
+            data = f"  data {json.dumps(file)} ({', '.join(heads)})\n"
             arguments += [f"{path} = data.c{k}" for k, path in enumerate(columns)]
         record = list(outputs) if outputs is not None else [*self.outputs, *self.states]
         if not record:
@@ -787,6 +850,23 @@ def load(path: str | os.PathLike[str]) -> Text:
 def loads(source: str, name: str = "text.fric") -> Text:
     """Loads a text; what it imports is found relative to ``name``."""
     return Text(_fric.Text(name, source, []))
+
+
+def rank(data: Any, *laws: str, **how: Any) -> list[Fit]:
+    """Fits the standard laws to one recording, as ``fric fit FILE.csv`` does, and ranks them: the best first.
+
+    ``data``: as for :meth:`Text.rank`; its headings are t, v, F or t, x, F or v, F, with units, as in ``{"t [s]": …, "v [mm/s]":
+    …, "F [N]": …}``. ``laws``: some of them, such as ``"LuGre"``. Options as for :meth:`Text.rank`.
+    """
+    table = _tables.of(data)
+    if table is None:
+        path = os.fspath(data)
+        table, stem = _fric.table(path), os.path.splitext(os.path.basename(path))[0]
+    else:
+        path, stem = "recording.csv", "recording"
+        how["data"] = data
+    made = Text(_fric.Text(f"{stem}_laws.fric", _fric.laws(table, path), []))
+    return made.rank(*([law.lower() for law in laws] or made.fits), **how)
 
 
 def model(name: str, /, **arguments: Any) -> Model:

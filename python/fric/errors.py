@@ -9,6 +9,7 @@ from typing import Any
 __all__ = [
     "CompileError",
     "Diagnostic",
+    "FitError",
     "InternalError",
     "RangeError",
     "RunError",
@@ -78,6 +79,10 @@ class UnitError(_Reported, TypeError):
 
 class RangeError(_Reported, ValueError):
     """A value outside its range, or a ``require`` that it violates. Nothing has changed."""
+
+
+class FitError(_Reported, RuntimeError):
+    """A fit without an answer: no start can be run, an unknown changes nothing, or there are too few rows."""
 
 
 class UnknownName(_Reported, KeyError):
@@ -158,6 +163,8 @@ class InternalError(RuntimeError):
 _UNITS = {"E0101", "E0102", "E0103", "E0104", "E0106", "E0108", "E0110"}
 _NAMES = {"E0201", "E0204", "E0205", "E0208"}
 _RANGES = {"E0501", "E0502"}
+# Codes of searches without an answer.
+_UNFITTED = {"E0906", "E0907", "E0910"}
 
 
 def of_problems(report: str, text: str, codes: list[str]) -> Exception:
@@ -173,4 +180,6 @@ def of_problems(report: str, text: str, codes: list[str]) -> Exception:
         kind = UnknownName
     elif code in _RANGES:
         kind = RangeError
+    elif code in _UNFITTED:
+        kind = FitError
     return kind(report, found)

@@ -202,7 +202,7 @@ impl Found {
     /// Compared minus recorded, in SI.
     #[getter]
     fn residuals<'py>(&self, py: Python<'py>) -> PyResult<Vec<Bound<'py, PyAny>>> {
-        columns(py, self.found.residuals())
+        columns(py, &self.found.residuals())
     }
 
     #[getter]

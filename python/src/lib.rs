@@ -44,10 +44,17 @@ mod _fric {
     use crate::text::{Run, Text, arrow_stream};
     use abi::unit::Unit;
     use numpy::PyArrayMethods;
-    use pyo3::exceptions::PyValueError;
+    use pyo3::exceptions::{PyOSError, PyValueError};
     use pyo3::prelude::*;
 
-    /// The file at a path as CSV text, and the text of a fit of each standard law to it, which names it by this path.
+    /// A recording on disk as CSV.
+    #[pyfunction]
+    fn table(py: Python, path: &str) -> PyResult<String> {
+        let read = crate::watched::guarded(py, || py.detach(|| fric::embed::table(path)))?;
+        read.map_err(|why| PyOSError::new_err(format!("cannot read {path}: {why}")))
+    }
+
+    /// A text with a fit of each standard law to a recording, which it names by this path. `recording`: its content as CSV.
     #[pyfunction]
     fn laws(py: Python, recording: &str, file: &str) -> PyResult<String> {
         let made = crate::watched::guarded(py, || py.detach(|| fric::embed::laws(recording, file)))?;

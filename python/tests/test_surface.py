@@ -215,6 +215,9 @@ text = fric.loads("model M { input u [1]  param k = 1  state x [1] = 0  dx/dt = 
 model, how = text.model("M"), {"step": "10 us", "method": "rk4", "outputs": ["x"]}
 s, slow = model.start(**how), model.start(interpret=True, **how)
 rows, many = np.zeros(4_000_000), np.zeros((64, 100_000))
+fit = fric.loads("import std.friction  fit f { run LuGre(v = data.v) data \\"r.csv\\" (t [s], v [m/s], F [N]) vary Fc in 0.1 N .. 10 N, Fs in 0.1 N .. 10 N, sigma0 in 1e4 N/m .. 1e6 N/m minimise rms(F - data.F) }")
+t = np.arange(300_000) * 1e-4
+data = {"t [s]": t, "v [m/s]": 0.01 * np.sin(t), "F [N]": np.sign(np.sin(t)) + 0.1 * np.sin(1e3 * t)}
 batch = {(n, i): model.batch(64, threads=n, interpret=i, **how) for n in (1, 2) for i in (False, True)}
 for _ in range(8):
     print("ready", flush=True)
@@ -233,6 +236,7 @@ for _ in range(8):
         'model.simulate(1e6, inputs={"u": 1.0}, solver="rk4", step="10 us")',
         "batch[1, False].hold(10**9, many[:, 0])", "batch[2, False].hold(10**9, many[:, 0])",
         "batch[1, True].follow(many)", "batch[2, True].follow(many)", 'fric.sweep(text, "e", vary={"k": [1.0, 2.0, 3.0]})',
+        "fit.fit(data=data, threads=1)", "fit.fit(data=data, robust=True, threads=2)",
     ],
 )  # fmt: skip
 def test_ctrl_c_ends_long_calls_within_50_ms(call):
@@ -274,13 +278,19 @@ def anything(chance):
     return values[kind]
 
 
+POINTS = "import std.friction  fit f { run CoulombViscous(v = data.v) data \"r.csv\" (v [m/s], F [N]) vary Fc in 0.1 N .. 10 N, Fv in 0.1 N·s/m .. 10 N·s/m minimise rms(F - data.F) }"
+SLIDING = {"v [m/s]": [1.0, -1.0, 2.0, -2.0, 3.0], "F [N]": [2.0, -2.1, 3.0, -2.9, 4.0]}
+
+
 def random_calls(chance, count):
     """Makes calls with wrong and right arguments; returns the number of exceptions by class."""
     model = fric.model("LuGre")
     text = fric.loads(OSCILLATOR)
     fine = (
-        TypeError, ValueError, KeyError, IndexError, RuntimeError, OverflowError, AttributeError, MemoryError,
+        TypeError, ValueError, KeyError, IndexError, RuntimeError, OverflowError, AttributeError, MemoryError, OSError,
     )  # fmt: skip
+    points = fric.loads(POINTS)
+    residuals = points.residuals(data=SLIDING)
     seen = {}
 
     def fresh():
@@ -328,6 +338,12 @@ def random_calls(chance, count):
                 lambda: text.model("Oscillator").linearise({"x": a[0]}),
                 lambda: s.set(Fs=a[0], Fc=a[1]),
                 lambda: fric.loads(a[0]),
+                lambda: points.fit(data={"v [m/s]": a[0], "F [N]": a[1]}, starts=2, threads=1),
+                lambda: points.fit(data=a[0], starts=2, threads=1),
+                lambda: points.fit(data=SLIDING, starts=a[0], seed=a[1], threads=1) if chance.random() < 0.2 else None,
+                lambda: points.rank(a[0], data=a[1]),
+                lambda: residuals(a[0]),
+                lambda: fric.rank(a[0], starts=1, threads=1),
             ]
         try:
             chance.choice(calls)()

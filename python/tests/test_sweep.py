@@ -209,7 +209,7 @@ def test_a_broken_pool_ends_a_sweep_that_another_engine_finishes(command, folder
                         os.kill(process, signal.SIGKILL)
 
         with pytest.raises(fric.SweepError, match="resume=True") as raised:
-            sweep(folder, runs, out=out, on=pool, unit=0.02, progress=kill)
+            sweep(folder, runs, out=out, on=pool, unit=0.002, progress=kill)
     first, last = raised.value.missing[0]
     assert 0 < first < last == 5 * runs
     with pytest.raises(ValueError, match="resume"):

@@ -8,7 +8,8 @@ use crate::commands::fit::conclusion::{Asked, Conclusion, Wishes, recordings, to
 use crate::commands::fit::rank::{self, Tried};
 use crate::commands::fit::search::{Runs, search};
 use crate::commands::fit::{after, answer, laws as standard};
-use crate::compile::{self, Loaded, Options};
+use crate::compile::{self, Loaded, Options, Sources};
+use crate::disk::Disk;
 use crate::named_files::NamedFiles;
 use crate::plot::{self, Look};
 use crate::terminal::Terminal;
@@ -55,7 +56,7 @@ pub struct Compared {
     pub label: String,
     /// The SI unit.
     pub si: String,
-    /// Times of the rows in s, as in the recording; the numbers of steady points.
+    /// Times of the rows in s, as in the recording; of steady points their numbers, from 0.
     pub times: Vec<f64>,
 }
 
@@ -80,7 +81,8 @@ impl Text {
     ) -> Result<Vec<Fit>, Problems> {
         let mut loaded = self.loaded.clone();
         let mut files = self.sources.all();
-        files.extend(tables.iter().map(|(name, text)| (String::new(), name.clone(), name.clone(), text.clone())));
+        let own = self.source().0;
+        files.extend(tables.iter().map(|(name, text)| (own.clone(), name.clone(), name.clone(), text.clone())));
         let sources = if tables.is_empty() { self.sources.clone() } else { NamedFiles::new(files) };
         let found = compile::check_declarations(&loaded, &sources);
         if found.iter().any(Diagnostic::is_error) {
@@ -145,7 +147,18 @@ impl Fit {
     /// # Errors
     /// Why the model cannot be run with them, in words.
     pub fn residuals(&self, values: &[f64]) -> Result<Vec<Vec<f64>>, String> {
-        self.runs.residuals(Way::Whole, values, &self.runs.steps())
+        self.runs.residuals(Way::Whole, values, &self.runs.steps()).map(|found| self.as_recorded(&found))
+    }
+
+    /// Residuals in the order of the rows in the file: steady points are run in another one.
+    fn as_recorded(&self, residuals: &[Vec<f64>]) -> Vec<Vec<f64>> {
+        let mut out = residuals.to_vec();
+        for (part, items) in self.runs.parts.iter().zip(self.runs.items()) {
+            for k in items.filter(|_| part.asks.steady) {
+                part.asks.points.iter().zip(&residuals[k]).for_each(|(row, value)| out[k][*row] = *value);
+            }
+        }
+        out
     }
 
     /// Searches for the values, and answers what is wished beside them.
@@ -267,8 +280,8 @@ impl FoundFit {
     }
 
     /// Compared minus recorded, in SI, in the order of [`Fit::compared`].
-    pub fn residuals(&self) -> &[Vec<f64>] {
-        &self.conclusion.fitted.answer.residuals
+    pub fn residuals(&self) -> Vec<Vec<f64>> {
+        self.fit.as_recorded(&self.conclusion.fitted.answer.residuals)
     }
 
     /// The length of the steps of each recording, of adaptive runs their tolerance.
@@ -343,4 +356,12 @@ impl FoundFit {
 /// What the recording lacks, in words.
 pub fn laws(recording: &str, file: &str) -> Result<String, String> {
     standard::text(recording, file)
+}
+
+/// A recording on disk as CSV, whatever the kind of its file.
+///
+/// # Errors
+/// Why it cannot be read, in words.
+pub fn table(path: &str) -> Result<String, String> {
+    Disk.file("", path).map(|(_, text)| text)
 }

@@ -12,6 +12,7 @@ use abi::lanes::Lanes;
 use abi::plan::Experiment;
 use abi::{Instance, Slot};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 /// Why a run has no values at some instants.
 #[derive(Debug)]
@@ -29,6 +30,7 @@ pub struct Tiles {
     left: usize,
     slots: usize,
     threads: usize,
+    stop: Option<Arc<AtomicBool>>,
 }
 
 /// Runs that advance in one thread.
@@ -73,7 +75,12 @@ impl Tiles {
                 None => groups.extend(some.into_iter().map(|one| Group::alone(one, instants, slots))),
             }
         }
-        Tiles { groups, left: instants.len(), slots: slots.len(), threads }
+        Tiles { groups, left: instants.len(), slots: slots.len(), threads, stop: None }
+    }
+
+    /// Lets all runs fail soon after this is set.
+    pub fn stop_by(self, stop: Option<Arc<AtomicBool>>) -> Tiles {
+        Tiles { stop, ..self }
     }
 
     /// The values at the next instants, at most so many: row-major, for each run in the order in which they were given. A
@@ -88,8 +95,13 @@ impl Tiles {
         self.left -= rows;
         let wanted = rows * self.slots;
         let share = self.groups.len().div_ceil(self.threads.max(1));
+        let stop = self.stop.as_deref();
         let read = |groups: &mut [Group]| -> Vec<Result<Vec<f64>, Missing>> {
-            groups.iter_mut().flat_map(|group| group.read((rows, wanted), is_last)).collect()
+            let mut watch = |_: f64| match stop.is_some_and(|stop| stop.load(Ordering::Relaxed)) {
+                true => Continue::Break(()),
+                false => Continue::Continue(()),
+            };
+            groups.iter_mut().flat_map(|group| group.read((rows, wanted), is_last, &mut watch)).collect()
         };
         if self.groups.len() <= share {
             return read(&mut self.groups);
@@ -122,9 +134,13 @@ impl Group {
     }
 
     /// The next rows of its runs, so many and as many values. `to_end`: these are the last ones.
-    fn read(&mut self, (rows, wanted): (usize, usize), to_end: bool) -> Vec<Result<Vec<f64>, Missing>> {
+    fn read(
+        &mut self,
+        (rows, wanted): (usize, usize),
+        to_end: bool,
+        watch: &mut dyn FnMut(f64) -> Continue,
+    ) -> Vec<Result<Vec<f64>, Missing>> {
         let Group { course, ended } = self;
-        let watch = &mut |_| Continue::Continue(());
         let has_enough = |probe: &Probe| !to_end && probe.rows() >= rows;
         match course {
             Course::Lanes(together, waiting, (instants, slots)) => {

@@ -270,7 +270,8 @@ impl Part {
             }));
         }
         let varying = held.map_or(&self.varying, |held| &held.varying);
-        let mut tiles = Tiles::new(varying.lanes(), all, (instants, slots), self.threads);
+        let tiles = Tiles::new(varying.lanes(), all, (instants, slots), self.threads);
+        let mut tiles = tiles.stop_by(self.stop.clone());
         // The filter of `thin` goes forward and backward over all rows.
         let is_filtered = self.asks.items.iter().any(|item| item.thin.is_some());
         let rows = if is_filtered { instants.len() } else { TILE };
