@@ -14,7 +14,7 @@ mod moved_contact;
 mod recordings_of_contacts;
 
 use moved_contact::{CONTACT, Chance, moved};
-use recordings_of_contacts::{Known, MASSES, far, found, fric, made, tap};
+use recordings_of_contacts::{KNOWN, Known, MASSES, far, found, fric, made, tap};
 use serde_json::Value;
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -42,27 +42,24 @@ fn contact(prefix: &str) -> Vec<Known> {
     CONTACT.iter().map(|(name, unit, value)| (leak(name), *unit, *value)).collect()
 }
 
-/// The run of a model of [`MASSES`], its position in the unit of the recording.
-fn positions(folder: &Path, model: &str, rest: &str) -> Vec<Vec<f64>> {
-    let truth = MASSES.replace(
-        "LuGre(v = v)",
-        "LuGre(v = v, sigma0 = 1e5 N/m, sigma1 = 316 N·s/m, sigma2 = 0.4 N·s/m, Fc = 1 N, Fs = 1.5 N, vs = 1 mm/s)",
-    );
-    made(folder, &format!("{truth}experiment e {{ run {model} {rest} solver adaptive tol 1e-10 }}\n"))
+/// A run of a model of [`MASSES`], its position in the unit of the recording.
+fn positions(folder: &Path, run: &str, rest: &str) -> Vec<Vec<f64>> {
+    made(folder, &format!("{MASSES}experiment e {{ run {run} {rest} solver adaptive tol 1e-10 }}\n"))
 }
 
 fn rows(folder: &Path) -> Vec<Row> {
     let of_contact = || moved().into_iter().map(|(t, v, force)| vec![t, v, force]).collect::<Vec<_>>();
-    let pulled = |model: &str| Recording {
+    let pulled = |contact: &str| Recording {
         file: "pull.csv",
         columns: "t [s],x [mm]",
-        rows: positions(folder, &format!("{model}()"), "for 30 s record x [mm] every 20 ms"),
+        rows: positions(folder, &format!("Pull(fr = {contact})"), "for 30 s record x [mm] every 20 ms"),
         noise: 2.0,
     };
     let forces: Vec<String> = (0..=2000).map(|k| format!("{:.3},{:e}\n", 1e-3 * f64::from(k), tap(k))).collect();
     fs::write(folder.join("u.csv"), "t [s],u [N]\n".to_string() + &forces.concat()).expect("it can be written");
     let presliding = || {
-        let made = positions(folder, "Tap(u = data.u)", "data \"u.csv\" (t [s], u [N]) record x [um] every 1 ms");
+        let run = format!("Tap(u = data.u, fr = {KNOWN})");
+        let made = positions(folder, &run, "data \"u.csv\" (t [s], u [N]) record x [um] every 1 ms");
         let rows = made.iter().enumerate().map(|(k, row)| vec![row[0], tap(k as u32), row[1]]).collect();
         Recording { file: "tap.csv", columns: "t [s],u [N],x [um]", rows, noise: 0.1 }
     };
@@ -91,16 +88,16 @@ fn rows(folder: &Path) -> Vec<Row> {
         Row {
             name: "presliding+slip",
             unknowns: contact(""),
-            recordings: vec![presliding(), pulled("PullBristle")],
+            recordings: vec![presliding(), pulled(KNOWN)],
             fit: "case slow { run Tap(u = data.u, fr = LuGre(sigma0 = sigma0, sigma1 = sigma1, sigma2 = sigma2, Fc = Fc, Fs = Fs, vs = vs)) data \"tap.csv\" (t [s], u [N], x [um]) minimise rms(x - data.x) / 0.1 um }
-  case slip { run PullBristle(fr = LuGre(sigma0 = sigma0, sigma1 = sigma1, sigma2 = sigma2, Fc = Fc, Fs = Fs, vs = vs)) data \"pull.csv\" (t [s], x [mm]) minimise rms(x - data.x) / 2 mm }",
+  case slip { run Pull(fr = LuGre(sigma0 = sigma0, sigma1 = sigma1, sigma2 = sigma2, Fc = Fc, Fs = Fs, vs = vs)) data \"pull.csv\" (t [s], x [mm]) minimise rms(x - data.x) / 2 mm }",
         },
-        Row { name: "KFM", unknowns: two.clone(), recordings: vec![pulled("Pull")], fit: pull },
+        Row { name: "KFM", unknowns: two.clone(), recordings: vec![pulled("KFM()")], fit: pull },
         Row {
             name: "Karnopp",
             unknowns: two,
-            recordings: vec![pulled("PullKarnopp")],
-            fit: "run PullKarnopp() data \"pull.csv\" (t [s], x [mm]) minimise rms(x - data.x) / 2 mm",
+            recordings: vec![pulled("Karnopp()")],
+            fit: "run Pull(fr = Karnopp()) data \"pull.csv\" (t [s], x [mm]) minimise rms(x - data.x) / 2 mm",
         },
         Row {
             name: "Maxwell",
@@ -111,8 +108,8 @@ fn rows(folder: &Path) -> Vec<Row> {
         Row {
             name: "slip",
             unknowns: contact("fr."),
-            recordings: vec![pulled("PullBristle")],
-            fit: "run PullBristle() data \"pull.csv\" (t [s], x [mm]) minimise rms(x - data.x) / 2 mm",
+            recordings: vec![pulled(KNOWN)],
+            fit: "run Pull(fr = LuGre()) data \"pull.csv\" (t [s], x [mm]) minimise rms(x - data.x) / 2 mm",
         },
     ]
 }

@@ -8,7 +8,7 @@ mod moved_contact;
 mod recordings_of_contacts;
 
 use moved_contact::{CONTACT, Chance, moved};
-use recordings_of_contacts::{Known, MASSES, far, found, fric, made, tap};
+use recordings_of_contacts::{KNOWN, Known, MASSES, far, found, fric, made, tap};
 use serde_json::Value;
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -974,12 +974,10 @@ fn presliding_is_identified_from_far_starts() {
     let folder = folder("presliding");
     let forces: Vec<String> = (0..=2000).map(|k| format!("{:.3},{:e}\n", 1e-3 * f64::from(k), tap(k))).collect();
     fs::write(folder.join("u.csv"), "t [s],u [N]\n".to_string() + &forces.concat()).unwrap();
-    let run = "experiment e { run Tap(u = data.u) data \"u.csv\" (t [s], u [N]) solver adaptive tol 1e-10 record x [um] every 1 ms }\n";
-    let truth = MASSES.replace(
-        "LuGre(v = v)",
-        "LuGre(v = v, sigma0 = 1e5 N/m, sigma1 = 316 N·s/m, sigma2 = 0.4 N·s/m, Fc = 1 N, Fs = 1.5 N, vs = 1 mm/s)",
+    let run = format!(
+        "experiment e {{ run Tap(u = data.u, fr = {KNOWN}) data \"u.csv\" (t [s], u [N]) solver adaptive tol 1e-10 record x [um] every 1 ms }}\n"
     );
-    let rows = made(&folder, &format!("{truth}{run}"));
+    let rows = made(&folder, &format!("{MASSES}{run}"));
     let mut chance = Chance(1);
     let noisy = rows
         .iter()
@@ -999,17 +997,18 @@ fn presliding_is_identified_from_far_starts() {
 /// `cargo bench --bench acceptance` does it for many seeds.
 #[test]
 fn stick_slip_with_regimes_is_identified_from_far_starts() {
-    for (model, seeds) in [("Pull", 5), ("PullKarnopp", 2)] {
-        let folder = folder(&format!("stick-slip-{model}"));
-        let run =
-            format!("experiment e {{ run {model}() for 30 s solver adaptive tol 1e-10 record x [mm] every 20 ms }}\n");
+    for (contact, seeds) in [("KFM", 5), ("Karnopp", 2)] {
+        let folder = folder(&format!("stick-slip-{contact}"));
+        let run = format!(
+            "experiment e {{ run Pull(fr = {contact}()) for 30 s solver adaptive tol 1e-10 record x [mm] every 20 ms }}\n"
+        );
         let rows = made(&folder, &format!("{MASSES}{run}"));
         for seed in 0..seeds {
             let mut chance = Chance(seed);
             let noisy = rows.iter().map(|row| format!("{:.2},{:e}\n", row[0], row[1] + 2.0 * chance.normal()));
             fs::write(folder.join("r.csv"), "t [s],x [mm]\n".to_string() + &noisy.collect::<String>()).unwrap();
             let fit = format!(
-                "fit f {{\n  run {model}()\n  data \"r.csv\" (t [s], x [mm])\n  vary {}\n  minimise rms(x - data.x) / 2 mm\n}}\n",
+                "fit f {{\n  run Pull(fr = {contact}())\n  data \"r.csv\" (t [s], x [mm])\n  vary {}\n  minimise rms(x - data.x) / 2 mm\n}}\n",
                 far(&mut chance, &SLIP)
             );
             fs::write(folder.join("f.fric"), format!("{MASSES}{fit}")).unwrap();

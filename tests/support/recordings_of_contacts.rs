@@ -9,11 +9,12 @@ use std::process::{Command, Output};
 /// An unknown parameter: its path in the model that is run, its unit, its true value.
 pub type Known = (&'static str, &'static str, f64);
 
-/// A mass on a LuGre contact under a recorded force, and masses on three contacts that a spring pulls.
+/// A mass on a contact under a recorded force, and one that a spring pulls. The contact is a slot.
 pub const MASSES: &str = "import std.friction
+import std.interfaces
 model Tap {
   input u [N]
-  part fr = LuGre(v = v)
+  part fr : Friction = LuGre(v = v)
   state x [m] = 0
   state v [m/s] = 0
   dx/dt = v
@@ -21,29 +22,17 @@ model Tap {
 }
 model Pull {
   let u = 2 N/m * (0.1 m/s * t - x)
-  part fr = KFM(v = v, F_ext = u)
-  state x [m] = 0
-  state v [m/s] = 0
-  dx/dt = v
-  dv/dt = (u - fr.F) / 1 kg
-}
-model PullKarnopp {
-  let u = 2 N/m * (0.1 m/s * t - x)
-  part fr = Karnopp(v = v, F_ext = u)
-  state x [m] = 0
-  state v [m/s] = 0
-  dx/dt = v
-  dv/dt = (u - fr.F) / 1 kg
-}
-model PullBristle {
-  let u = 2 N/m * (0.1 m/s * t - x)
-  part fr = LuGre(v = v)
+  part fr : Friction = KFM(v = v, F_ext = u)
   state x [m] = 0
   state v [m/s] = 0
   dx/dt = v
   dv/dt = (u - fr.F) / 1 kg
 }
 ";
+
+/// The bristle of the recordings.
+pub const KNOWN: &str =
+    "LuGre(sigma0 = 1e5 N/m, sigma1 = 316 N·s/m, sigma2 = 0.4 N·s/m, Fc = 1 N, Fs = 1.5 N, vs = 1 mm/s)";
 
 /// A recorded force that keeps a mass in presliding, row by row at 1 kHz: a tap, then a triangle of 90 % of stiction.
 pub fn tap(k: u32) -> f64 {
