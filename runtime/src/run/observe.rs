@@ -22,6 +22,9 @@ pub(crate) struct Observer {
     pub(crate) probe: Probe,
 }
 
+/// Rows for which a probe makes room at once.
+const ROOM: usize = 4096;
+
 /// Records the values of some slots at given instants, in ascending order.
 pub(crate) struct Probe {
     instants: Arc<[f64]>,
@@ -61,13 +64,26 @@ impl Probe {
 
     /// Records the values at the instants to which a point of a stretch is the nearest. `half`: of a step, in s.
     pub(crate) fn take_stretch(&mut self, stretch: &Stretch, half: f64) {
-        let columns: Vec<&[f64]> = self.slots.iter().map(|slot| stretch.column(*slot)).collect();
+        let instants = &self.instants[self.passed..];
+        let mut points: Vec<usize> = Vec::with_capacity(stretch.len());
         for (point, time) in stretch.times().iter().enumerate() {
-            while self.instants.get(self.passed).is_some_and(|instant| *instant < time + half) {
-                self.values.extend(columns.iter().map(|column| column[point]));
-                self.passed += 1;
+            let end = time + half;
+            while instants.get(points.len()).is_some_and(|instant| *instant < end) {
+                points.push(point);
             }
         }
+        let (begin, width) = (self.values.len(), self.slots.len());
+        if self.values.capacity() - begin < width * points.len() {
+            self.values.reserve(width * instants.len().min(ROOM).max(points.len()));
+        }
+        self.values.resize(begin + width * points.len(), 0.0);
+        for (k, slot) in self.slots.iter().enumerate() {
+            let column = stretch.column(*slot);
+            for (to, point) in self.values[begin + k..].iter_mut().step_by(width).zip(&points) {
+                *to = column[*point];
+            }
+        }
+        self.passed += points.len();
     }
 
     /// Number of rows that have not been drawn.
