@@ -1,5 +1,5 @@
-//! What fits cost: `cargo bench --bench fits`. A run in lanes and a Jacobian beside loops by numba, with the same rows, and
-//! the whole procedure for presliding and stick-slip together, on one core.
+//! What fits cost: `cargo bench --bench fits`. A run in lanes and a Jacobian beside loops by numba, with the same rows, on one
+//! core. `acceptance` times whole fits.
 //!
 //! numba runs in `python3`, or in the Python of `FRIC_PYTHON`; without it there are no ratios. Times are of the processor,
 //! the least of some repetitions.
