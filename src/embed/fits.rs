@@ -114,7 +114,7 @@ impl Fit {
     pub fn unknowns(&self) -> Vec<Unknown> {
         let several = self.runs.parts.len() > 1;
         let one = |unknown: &compile::FitUnknown| {
-            let is_shared = !unknown.own && !(several && unknown.of.is_some()) && !unknown.initial;
+            let is_shared = !(unknown.own || unknown.initial || several && unknown.of.is_some());
             Unknown {
                 label: unknown.label.clone(),
                 path: is_shared.then(|| unknown.path.clone()),

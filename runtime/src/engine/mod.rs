@@ -14,7 +14,7 @@ pub mod sweep;
 use crate::coupling::sil;
 use crate::record::{Recorder, Recording};
 use crate::run::fixed::Fixed;
-use crate::run::observe::{Observer, Probe, check_status};
+use crate::run::observe::{Observer, check_status};
 use crate::run::outcome::Stop;
 pub use crate::run::outcome::{Cause, Continue, Estimate, Failure, Final, Outcome, Work};
 use crate::run::stepper::{self, Rest, Stepper};
@@ -74,8 +74,7 @@ pub fn sample(
     watch: &mut dyn FnMut(f64) -> Continue,
 ) -> (Vec<f64>, Result<(), Failure>) {
     let bare = bare(experiment);
-    let mut observer = Observer::new(&bare);
-    observer.probe = Probe::new(&Arc::from(instants), slots);
+    let observer = Observer::probing(&bare, &Arc::from(instants), slots);
     let (rest, result) = go(instance, &bare, observer, &mut |_| (), watch);
     (rest.observer.probe.values(), result.map_err(failed))
 }

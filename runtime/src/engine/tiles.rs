@@ -114,16 +114,10 @@ impl Tiles {
     }
 }
 
-fn observer(experiment: &Experiment, instants: &Arc<[f64]>, slots: &[Slot]) -> Observer {
-    let mut observer = Observer::new(experiment);
-    observer.probe = Probe::new(instants, slots);
-    observer
-}
-
 impl Group {
     fn alone((instance, experiment): (Instance, Experiment), instants: &Arc<[f64]>, slots: &[Slot]) -> Group {
         let experiment = bare(&experiment);
-        match start(instance, &experiment, observer(&experiment, instants, slots), &mut |_| ()) {
+        match start(instance, &experiment, Observer::probing(&experiment, instants, slots), &mut |_| ()) {
             Ok(course) => Group { course: Course::Alone(Some(course)), ended: vec![None] },
             Err(ended) => {
                 let (rest, stop) = *ended;
@@ -160,7 +154,7 @@ impl Group {
                     let mut give = |number: usize, rest: stepper::Rest, result: Result<(), _>| {
                         ended[number] = Some((rest.observer.probe, result.map_err(failed)));
                     };
-                    let observer = |experiment: &Experiment| observer(experiment, instants, slots);
+                    let observer = |experiment: &Experiment| Observer::probing(experiment, instants, slots);
                     together.round(&observer, &mut next, &mut give, watch);
                 }
             }

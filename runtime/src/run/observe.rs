@@ -42,7 +42,7 @@ impl Default for Probe {
 }
 
 impl Probe {
-    pub(crate) fn new(instants: &Arc<[f64]>, slots: &[Slot]) -> Probe {
+    fn new(instants: &Arc<[f64]>, slots: &[Slot]) -> Probe {
         Probe { instants: instants.clone(), slots: slots.to_vec(), passed: 0, values: Vec::new() }
     }
 
@@ -116,6 +116,11 @@ impl Observer {
         slots.sort();
         slots.dedup();
         Observer { expectations, recorder, slots, probe: Probe::default() }
+    }
+
+    /// The same, which also records these slots at these instants.
+    pub(crate) fn probing(experiment: &Experiment, instants: &Arc<[f64]>, slots: &[Slot]) -> Observer {
+        Observer { probe: Probe::new(instants, slots), ..Observer::new(experiment) }
     }
 
     /// Whether all observers need only the last point of a run.
