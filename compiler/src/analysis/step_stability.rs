@@ -15,7 +15,7 @@ use crate::ir::Func;
 use crate::ir::build::{Build, Env};
 use crate::ir::expr::Shared;
 use crate::ir::hash::HashMap;
-use crate::ir::interpret::run_once;
+use crate::ir::interpret::{run_each, run_once, run_while};
 use crate::ir::program::Program;
 use crate::math::expand;
 use crate::numerics::autodiff;
@@ -217,9 +217,7 @@ struct Found<'b> {
 /// none. `ends`: outputs that are not 0 where a run ends. `None` for a program that is not analysed
 /// ([`Bench::new`]). This number is the one that diagnostics, explanations and predictions name.
 pub fn largest_stable(program: &Program, ends: &[Slot], method: Method) -> Option<f64> {
-    static KNOWN: Memo<Option<f64>> = Memo::new();
-    let also: Vec<u64> = ends.iter().map(|slot| u64::from(slot.0)).chain([method as u64]).collect();
-    KNOWN.answer(program, &also, || Bench::new(program, ends).map(|bench| bench.largest_stable(method)))
+    Some(Bench::new(program, ends)?.largest_stable(method))
 }
 
 /// A value at which an open input is held while others vary: 0 if that is in its range.
@@ -331,32 +329,43 @@ impl<'a> Bench<'a> {
         self.ends.iter().any(|slot| block[slot.index()] != 0.0)
     }
 
-    /// The matrix that a function writes after the block.
-    fn matrix(&self, func: &Func, block: &[f64], h: f64) -> Vec<f64> {
-        let mut block = block.to_vec();
-        block[Slot::STEP.index()] = h;
-        run_once(func, &mut block, &self.program.description.pool);
-        block.split_off(self.program.description.layout.size())
+    /// The matrix that a function writes after each of some blocks.
+    fn matrices(&self, func: &Func, blocks: &[&[f64]], h: f64) -> Vec<Vec<f64>> {
+        let mut blocks: Vec<Vec<f64>> = blocks.iter().map(|block| block.to_vec()).collect();
+        blocks.iter_mut().for_each(|block| block[Slot::STEP.index()] = h);
+        run_each(func, &mut blocks, &self.program.description.pool, 1);
+        blocks.iter_mut().map(|block| block.split_off(self.program.description.layout.size())).collect()
     }
 
     /// The growth of deviations in one step at this point, if it exceeds that of the model, and the state with the
     /// largest share.
     fn grows(&self, stepper: &Stepper, block: &[f64], h: f64) -> Option<(f64, usize)> {
+        self.grow(stepper, &[block], h)[0]
+    }
+
+    /// The same for each of these points.
+    fn grow(&self, stepper: &Stepper, blocks: &[&[f64]], h: f64) -> Vec<Option<(f64, usize)>> {
         let n = self.n;
-        let step = self.matrix(&stepper.derivative, block, h);
-        let (growth, power) = radius(&step, n, 1.0 + 2.0 * MARGIN)?;
-        // An unstable model may grow, but the step by no more than twice the model's own rate; otherwise the falling
-        // branch of a Stribeck curve would mask the instability of a bristle.
-        let model = self.matrix(&self.code.jacobian, block, h);
-        if let Some((own, _)) = radius(&exponential(&model, n, h), n, 1.0 + MARGIN)
-            && (own.is_nan() || growth - 1.0 <= 2.0 * (own - 1.0) + 2.0 * MARGIN)
-        {
-            return None;
-        }
-        // The diagonal of the rank-one matrix v·wᵀ measures the share of each state independently of units.
-        let part = |k: &usize| power[k * n + k].abs();
-        let state = (0..n).filter(|k| !part(k).is_nan()).max_by(|a, b| part(a).total_cmp(&part(b))).unwrap_or(0);
-        Some((growth, state))
+        let steps = self.matrices(&stepper.derivative, blocks, h);
+        let grown: Vec<_> = steps.iter().map(|step| radius(step, n, 1.0 + 2.0 * MARGIN)).collect();
+        let growing: Vec<&[f64]> =
+            blocks.iter().zip(&grown).filter_map(|(block, grown)| grown.as_ref().and(Some(*block))).collect();
+        let mut models = self.matrices(&self.code.jacobian, &growing, h).into_iter();
+        let mut beyond_model = |(growth, power): (f64, Vec<f64>)| {
+            // An unstable model may grow, but the step by no more than twice the model's own rate; otherwise the falling
+            // branch of a Stribeck curve would mask the instability of a bristle.
+            let model = models.next().expect("one for each point at which the step grows");
+            if let Some((own, _)) = radius(&exponential(&model, n, h), n, 1.0 + MARGIN)
+                && (own.is_nan() || growth - 1.0 <= 2.0 * (own - 1.0) + 2.0 * MARGIN)
+            {
+                return None;
+            }
+            // The diagonal of the rank-one matrix v·wᵀ measures the share of each state independently of units.
+            let part = |k: &usize| power[k * n + k].abs();
+            let state = (0..n).filter(|k| !part(k).is_nan()).max_by(|a, b| part(a).total_cmp(&part(b))).unwrap_or(0);
+            Some((growth, state))
+        };
+        grown.into_iter().map(|grown| grown.and_then(&mut beyond_model)).collect()
     }
 
     /// The points of all scans: at most as many as can be examined.
@@ -378,13 +387,16 @@ impl<'a> Bench<'a> {
                             continue;
                         }
                         farthest = farthest.max(value.abs());
-                        let block = self.relaxed(block);
                         points.push(Point { setting, value: *value, block, fastest: OnceCell::new() });
                     }
                 }
                 Scanned { scan, points, closed, farthest }
             };
-            self.scans().into_iter().map(one).collect()
+            let mut scanned: Vec<Scanned> = self.scans().into_iter().map(one).collect();
+            let points = scanned.iter_mut().flat_map(|scanned| &mut scanned.points);
+            let mut blocks: Vec<&mut Vec<f64>> = points.map(|point| &mut point.block).collect();
+            self.relax(&self.code.relaxing, &mut blocks);
+            scanned
         })
     }
 
@@ -437,13 +449,13 @@ impl<'a> Bench<'a> {
             let count = if all <= most { points.len() } else { (points.len() * most).div_ceil(all) };
             let mut order: Vec<&Point> = points.iter().collect();
             order.sort_by(|a, b| b.value.abs().total_cmp(&a.value.abs()));
+            order.truncate(count);
+            self.drop_slow(&mut order, h);
+            let blocks: Vec<&[f64]> = order.iter().map(|point| &*point.block).collect();
+            let growths = self.grow(stepper, &blocks, h);
             // Unstable points with their growth and state.
-            let found: Vec<(&Point, f64, usize)> = order
-                .into_iter()
-                .take(count)
-                .filter(|point| !self.follows(point, h))
-                .filter_map(|point| self.grows(stepper, &point.block, h).map(|(growth, state)| (point, growth, state)))
-                .collect();
+            let grown = |(point, grown): (_, Option<(f64, usize)>)| grown.map(|(growth, state)| (point, growth, state));
+            let found: Vec<(&Point, f64, usize)> = order.into_iter().zip(growths).filter_map(grown).collect();
             // The farthest of the worst points, where a run diverges soonest.
             let by_growth = |a: &f64, b: &f64| a.min(1e9).total_cmp(&b.min(1e9));
             let worst =
@@ -464,16 +476,21 @@ impl<'a> Bench<'a> {
 
     /// The start blocks after fast states have relaxed.
     fn rest(&self) -> &[Vec<f64>] {
-        self.rest.get_or_init(|| self.settings().into_iter().map(|block| self.relaxed(block)).collect())
+        self.rest.get_or_init(|| {
+            let mut blocks = self.settings();
+            self.relax(&self.code.relaxing, &mut blocks);
+            blocks
+        })
     }
 
-    /// Whether a step of this length is so short at a point that the model need not be compared with it.
-    fn follows(&self, point: &Point, h: f64) -> bool {
-        let fastest = point.fastest.get_or_init(|| {
-            let model = self.matrix(&self.code.jacobian, &point.block, 0.0);
-            radius(&model, self.n, 0.0).map_or(0.0, |(fastest, _)| fastest)
-        });
-        h * fastest <= self.slow
+    /// Drops the points at which a step of this length is so short that the model need not be compared with it.
+    fn drop_slow(&self, points: &mut Vec<&Point>, h: f64) {
+        let unknown: Vec<&Point> = points.iter().filter(|point| point.fastest.get().is_none()).copied().collect();
+        let blocks: Vec<&[f64]> = unknown.iter().map(|point| &*point.block).collect();
+        for (point, model) in unknown.iter().zip(self.matrices(&self.code.jacobian, &blocks, 0.0)) {
+            point.fastest.get_or_init(|| radius(&model, self.n, 0.0).map_or(0.0, |(fastest, _)| fastest));
+        }
+        points.retain(|point| !point.fastest.get().is_some_and(|fastest| h * fastest <= self.slow));
     }
 
     /// The point at which the model itself grows fastest, if that is too fast for a step by `implicit`. Its equations
@@ -492,18 +509,21 @@ impl<'a> Bench<'a> {
         let mut work = WORK / cost;
         let mut worst: Option<Singular> = None;
         for scan in self.scans() {
-            for value in scan.values.iter().flat_map(|value| EIGHTHS.map(|part| value * part)) {
-                let (low, high) = self.quantity(scan.slot).map_or((value, value), |quantity| quantity.range);
-                if !(low..=high).contains(&value) {
-                    continue;
-                }
-                let Some(left) = work.checked_sub(1) else { return worst };
-                work = left;
-                let block = self.at(&self.base, scan.slot, value);
-                if self.ended(&block) {
-                    continue;
-                }
-                let model = self.matrix(&self.code.jacobian, &self.relaxed_around(block, scan.slot), h);
+            let (low, high) = self.quantity(scan.slot).map_or((f64::NEG_INFINITY, f64::INFINITY), |q| q.range);
+            let mut values: Vec<f64> = scan.values.iter().flat_map(|value| EIGHTHS.map(|part| value * part)).collect();
+            values.retain(|value| (low..=high).contains(value));
+            values.truncate(work);
+            work -= values.len();
+            let at = |value: f64| {
+                Some((value, self.at(&self.base, scan.slot, value))).filter(|(_, block)| !self.ended(block))
+            };
+            let (values, mut blocks): (Vec<f64>, Vec<Vec<f64>>) = values.into_iter().filter_map(at).unzip();
+            // The quantity is held: otherwise a mass would slow down and leave the examined speed.
+            let mut holding = self.code.relaxing.clone();
+            holding.stores.retain(|(slot, _)| *slot != scan.slot);
+            self.relax(&holding, &mut blocks);
+            let blocks: Vec<&[f64]> = blocks.iter().map(Vec::as_slice).collect();
+            for (value, model) in values.into_iter().zip(self.matrices(&self.code.jacobian, &blocks, h)) {
                 let Some((growth, _)) = radius(&exponential(&model, n, h), n, exp(limit * h)) else { continue };
                 let rate = ln(growth) / h;
                 if rate.is_finite() && worst.as_ref().is_none_or(|worst| rate > worst.rate) {
@@ -534,31 +554,29 @@ impl<'a> Bench<'a> {
 
     /// A nearby point at which the fast states have relaxed. The response of a step to a state that is momentarily far
     /// off does not show where a run goes.
-    fn relaxed(&self, mut block: Vec<f64>) -> Vec<f64> {
-        let begin = block.clone();
-        block[Slot::STEP.index()] = RELAXING.1;
-        for _ in 0..RELAXING.0 {
-            run_once(&self.code.relaxing, &mut block, &self.program.description.pool);
-        }
-        let states = self.program.description.layout.states.range();
-        if block[states].iter().all(|x| x.is_finite()) { block } else { begin }
+    fn relaxed(&self, block: Vec<f64>) -> Vec<f64> {
+        let mut blocks = [block];
+        self.relax(&self.code.relaxing, &mut blocks);
+        let [block] = blocks;
+        block
     }
 
-    /// As [`relaxed`](Self::relaxed), with one quantity held: otherwise a mass would slow down and leave the examined
-    /// speed.
-    fn relaxed_around(&self, mut block: Vec<f64>, held: Slot) -> Vec<f64> {
-        let (begin, value) = (block.clone(), block[held.index()]);
-        block[Slot::STEP.index()] = RELAXING.1;
-        for _ in 0..RELAXING.0 {
-            run_once(&self.code.relaxing, &mut block, &self.program.description.pool);
-            block[held.index()] = value;
-        }
+    /// Lets the fast states of some blocks relax, by steps of this function; where they diverge, the block remains as it
+    /// was.
+    fn relax<B: AsMut<[f64]> + AsRef<[f64]>>(&self, by: &Func, blocks: &mut [B]) {
+        let begin: Vec<Vec<f64>> = blocks.iter().map(|block| block.as_ref().to_vec()).collect();
+        blocks.iter_mut().for_each(|block| block.as_mut()[Slot::STEP.index()] = RELAXING.1);
+        run_each(by, blocks, &self.program.description.pool, RELAXING.0);
         let states = self.program.description.layout.states.range();
-        if block[states].iter().all(|x| x.is_finite()) { block } else { begin }
+        for (block, begin) in blocks.iter_mut().map(AsMut::as_mut).zip(begin) {
+            if block[states.clone()].iter().any(|x| !x.is_finite()) {
+                block.copy_from_slice(&begin);
+            }
+        }
     }
 
     fn rate(&self, block: &[f64], state: usize) -> f64 {
-        -self.matrix(&self.code.jacobian, block, 0.0)[state * self.n + state]
+        -self.matrices(&self.code.jacobian, &[block], 0.0)[0][state * self.n + state]
     }
 
     /// Operations for one point.
@@ -585,7 +603,13 @@ impl<'a> Bench<'a> {
 
     /// The largest step of a method in s for which [`unstable`](Self::unstable) finds nothing, searched upwards, because
     /// a step beyond the first unstable one is of no use.
-    fn largest_stable(&self, method: Method) -> f64 {
+    pub fn largest_stable(&self, method: Method) -> f64 {
+        static KNOWN: Memo<f64> = Memo::new();
+        let also: Vec<u64> = self.ends.iter().map(|slot| u64::from(slot.0)).chain([method as u64]).collect();
+        KNOWN.answer(self.program, &also, || self.search_largest(method))
+    }
+
+    fn search_largest(&self, method: Method) -> f64 {
         let stepper = self.stepper(method);
         let found = |h: f64| self.found(&stepper, method, self.dividing(h), SEARCH_WORK);
         if found(SHORTEST).is_some() {
@@ -739,13 +763,11 @@ impl<'a> Bench<'a> {
         let first = at[layout.states.range()].to_vec();
         // Limit on the cost of a run.
         let most = WORK / (2 * step.ops.len());
-        for _ in 0..steps.min(most.max(RUN)) {
-            run_once(&step, &mut at, &program.description.pool);
+        run_while(&step, &mut at, &program.description.pool, steps.min(most.max(RUN)), |at| {
             let now = &at[layout.states.range()];
-            if look(&first, now).is_break() || now.iter().any(|x| !x.is_finite()) {
-                break;
-            }
-        }
+            look(&first, now)?;
+            if now.iter().all(|x| x.is_finite()) { ControlFlow::Continue(()) } else { ControlFlow::Break(()) }
+        });
     }
 
     /// A state whose rate jumps at a change of its sign and opposes it on both sides, so that fixed steps of this

@@ -6,9 +6,7 @@
 
 use crate::analysis::explain::{SelfDependence, states};
 use crate::analysis::memo::Memo;
-use crate::analysis::step_stability::{
-    Bench, Chatter, LONGEST, Singular, StabilityLimit, Unstable, largest_stable, ten_to,
-};
+use crate::analysis::step_stability::{Bench, Chatter, LONGEST, Singular, StabilityLimit, Unstable, ten_to};
 use crate::frontend::source::Files;
 use crate::frontend::system::*;
 use crate::frontend::units::Types;
@@ -21,6 +19,7 @@ use abi::unit::Unit;
 use grammar::ast::BinaryOp;
 use grammar::diagnostic::Diagnostic;
 use grammar::span::Span;
+use std::cell::LazyCell;
 
 /// A system in fixed steps, and the related spans of the text.
 pub struct Fixed<'a> {
@@ -63,8 +62,10 @@ pub fn check(fixed: &Fixed, files: &Files) -> Vec<Diagnostic> {
     static KNOWN: Memo<Finding> = Memo::new();
     let also: Vec<u64> =
         ends.iter().map(|slot| u64::from(slot.0)).chain([fixed.step.to_bits(), fixed.method as u64]).collect();
-    match KNOWN.answer(fixed.program, &also, || Finding::of(fixed.program, &ends, fixed.method, fixed.step)) {
-        Finding::Unstable(unstable) => vec![fixed.unstable(&unstable, files)],
+    // Its points also serve the remedies.
+    let bench = LazyCell::new(|| Bench::new(fixed.program, &ends));
+    match KNOWN.answer(fixed.program, &also, || Finding::of(bench.as_ref(), fixed.method, fixed.step)) {
+        Finding::Unstable(unstable) => vec![fixed.unstable(&unstable, bench.as_ref(), files)],
         Finding::Singular(singular) => vec![fixed.singular(&singular)],
         Finding::Chatters(chatter) => vec![fixed.chatters(&chatter)],
         Finding::Nothing => Vec::new(),
@@ -81,8 +82,8 @@ enum Finding {
 
 impl Finding {
     /// The finding for a program that is run in steps of one length.
-    fn of(program: &Program, ends: &[Slot], method: Method, step: f64) -> Finding {
-        let Some(bench) = Bench::new(program, ends) else { return Finding::Nothing };
+    fn of(bench: Option<&Bench>, method: Method, step: f64) -> Finding {
+        let Some(bench) = bench else { return Finding::Nothing };
         // A chattering state is also unstable; the jump is the cause.
         if let Some(chatter) = bench.chatters(method, step) {
             return Finding::Chatters(chatter);
@@ -106,7 +107,7 @@ impl Fixed<'_> {
         self.system.var_ids().filter(continuous).nth(number).expect("the program has a slot for each state")
     }
 
-    fn unstable(&self, unstable: &Unstable, files: &Files) -> Diagnostic {
+    fn unstable(&self, unstable: &Unstable, bench: Option<&Bench>, files: &Files) -> Diagnostic {
         let (system, id) = (self.system, self.state(unstable.state));
         let var = system.var(id);
         let (method, step) = (self.method.name(), duration(self.step, 3));
@@ -121,9 +122,8 @@ impl Fixed<'_> {
         };
         let scanned = unstable.along.as_ref().and_then(|along| Some((along, self.name_of(along, var.instance)?)));
         let open = scanned.as_ref().is_some_and(|(along, _)| !along.closed);
-        let largest = largest_stable(self.program, &self.ends_at(), self.method).unwrap_or(0.0);
         // Stability need not be monotonic in the step; this one is known to be too long.
-        let largest = largest.min(0.95 * self.step);
+        let largest = bench.map_or(0.0, |bench| bench.largest_stable(self.method)).min(0.95 * self.step);
         let needed = stable_up_to(largest);
 
         let message = match open {
@@ -183,7 +183,7 @@ impl Fixed<'_> {
                  `fric explain {file} {}` shows the numbers per state",
                 var.name, self.name
             ),
-            false if self.is_stable_by_implicit() => {
+            false if bench.is_some_and(|bench| self.is_stable_by_implicit(bench)) => {
                 format!("`{solver} implicit` is stable at this step; or {shorter}")
             }
             false => format!("{shorter}{}", self.adaptive()),
@@ -193,14 +193,10 @@ impl Fixed<'_> {
     }
 
     /// Whether `implicit`, which is another method, is stable with this step.
-    fn is_stable_by_implicit(&self) -> bool {
+    fn is_stable_by_implicit(&self, bench: &Bench) -> bool {
         static KNOWN: Memo<bool> = Memo::new();
-        let ends = self.ends_at();
-        let also: Vec<u64> = ends.iter().map(|slot| u64::from(slot.0)).chain([self.step.to_bits()]).collect();
-        let is_stable = || {
-            let bench = Bench::new(self.program, &ends);
-            bench.is_some_and(|bench| bench.unstable(Method::Implicit, self.step).is_none())
-        };
+        let also: Vec<u64> = self.ends.iter().map(|(_, slot)| u64::from(slot.0)).chain([self.step.to_bits()]).collect();
+        let is_stable = || bench.unstable(Method::Implicit, self.step).is_none();
         self.method != Method::Implicit && KNOWN.answer(self.program, &also, is_stable)
     }
 

@@ -4,13 +4,16 @@
 //! with it to the bit.
 
 use crate::ir::cfg::{Area, BlockId, Cfg, Count, Inst, Place, Terminator};
-use crate::ir::eval::evaluate;
+use crate::ir::eval::{evaluate, evaluate_each};
 use crate::ir::hash::HashMap;
+use crate::ir::variance::{Slots, Variance, of_ops};
 use crate::ir::verify::{Stage, verify};
 use crate::ir::{Func, Op, Value};
 use abi::table::Interpret;
-use abi::{Function, Layout};
+use abi::{Function, Layout, Slot};
+use std::array::from_fn;
 use std::cell::Cell;
+use std::ops::{ControlFlow, Deref};
 
 thread_local! {
     /// Scratch space for the values of a function, kept from call to call.
@@ -65,6 +68,91 @@ pub fn run_once(func: &Func, block: &mut [f64], pool: &[f64]) -> u64 {
     repeat(func, block, pool, &mut vec![0; func.ops.len()], 1)
 }
 
+/// Runs an expanded function `times` times on each of some blocks. They end as [`run_once`] would leave them. Operations
+/// whose slots are equal in all blocks are evaluated once.
+pub fn run_each<B: AsMut<[f64]> + AsRef<[f64]>>(func: &Func, blocks: &mut [B], pool: &[f64], times: usize) {
+    let Some((first, others)) = blocks.split_first() else { return };
+    let differs = |slot: Slot| {
+        let bits = |block: &B| block.as_ref()[slot.index()].to_bits();
+        others.iter().any(|other| bits(other) != bits(first))
+    };
+    let mut residual = Residual::<AT_ONCE>::new(func, first.as_ref(), pool, differs);
+    for some in blocks.chunks_mut(AT_ONCE) {
+        let mut some: Vec<&mut [f64]> = some.iter_mut().map(AsMut::as_mut).collect();
+        for _ in 0..times {
+            residual.run(&mut some, pool);
+        }
+    }
+}
+
+/// Runs an expanded function up to `count` times, whatever its status, until `look` breaks, which sees the block after
+/// each time.
+pub fn run_while(
+    func: &Func,
+    block: &mut [f64],
+    pool: &[f64],
+    count: usize,
+    mut look: impl FnMut(&[f64]) -> ControlFlow<()>,
+) {
+    let mut residual = Residual::<1>::new(func, block, pool, |_| false);
+    for _ in 0..count {
+        residual.run(&mut [&mut *block], pool);
+        if look(block).is_break() {
+            return;
+        }
+    }
+}
+
+/// Number of blocks that [`run_each`] advances at once: the processor decodes an operation once for all of them, and
+/// their numbers fill vectors.
+const AT_ONCE: usize = 8;
+
+/// A function whose invariant operations have been evaluated, for runs on `N` blocks at once.
+struct Residual<'f, const N: usize> {
+    func: &'f Func,
+    /// Indices of the other operations.
+    rest: Vec<usize>,
+    values: Vec<[u64; N]>,
+}
+
+impl<'f, const N: usize> Residual<'f, N> {
+    /// `block`: any of the blocks; `differs`: whether they differ in a slot before the first run.
+    fn new(func: &'f Func, block: &[f64], pool: &[f64], differs: impl Fn(Slot) -> bool) -> Residual<'f, N> {
+        let slots = Slots::new(func.stores.iter().map(|(slot, _)| *slot), None);
+        let at_least = |i: usize| match func.ops[i] {
+            Op::Load(slot) if differs(slot) => Variance::State,
+            _ => Variance::Parameters,
+        };
+        let variance = of_ops(&func.ops, &slots, at_least);
+        let (once, rest): (Vec<usize>, Vec<usize>) = (0..func.ops.len()).partition(|i| variance[*i].is_invariant());
+        let mut values = vec![[0; N]; func.ops.len()];
+        operations(func, once.into_iter(), &[block], pool, &mut values);
+        Residual { func, rest, values }
+    }
+
+    /// Runs the function once on each block: at most `N`.
+    fn run(&mut self, blocks: &mut [&mut [f64]], pool: &[f64]) {
+        /// The same with instructions for fused products, for rounding to integers and for vectors.
+        #[cfg(target_arch = "x86_64")]
+        #[target_feature(enable = "fma,avx2")]
+        fn with_vectors<const N: usize>(of: &mut Residual<N>, blocks: &mut [&mut [f64]], pool: &[f64]) {
+            of.all(blocks, pool);
+        }
+        #[cfg(target_arch = "x86_64")]
+        if is_x86_feature_detected!("fma") && is_x86_feature_detected!("avx2") {
+            // SAFETY: the processor has just been asked for both.
+            return unsafe { with_vectors(self, blocks, pool) };
+        }
+        self.all(blocks, pool);
+    }
+
+    #[inline(always)]
+    fn all(&mut self, blocks: &mut [&mut [f64]], pool: &[f64]) {
+        operations(self.func, self.rest.iter().copied(), blocks, pool, &mut self.values);
+        results(self.func, blocks, &self.values);
+    }
+}
+
 /// Runs a function up to `count` times, until a status that is not 0. `values` is scratch space for the bits of every
 /// value.
 fn repeat(func: &Func, block: &mut [f64], pool: &[f64], values: &mut [u64], count: u64) -> u64 {
@@ -98,28 +186,48 @@ fn until_status(count: u64, mut run: impl FnMut() -> u64) -> u64 {
 /// Runs a function once.
 #[inline(always)]
 fn run(func: &Func, block: &mut [f64], pool: &[f64], values: &mut [u64]) -> u64 {
-    for (i, op) in func.ops.iter().enumerate() {
-        values[i] = match *op {
-            Op::Load(slot) => block[slot.index()].to_bits(),
-            Op::Pool { base, len, index } => {
-                let index = values[index.index()].min(u64::from(len) - 1);
-                pool[base as usize + index as usize].to_bits()
-            }
-            Op::Ring { base, len, index } => {
-                let index = values[index.index()].min(u64::from(len) - 1);
-                block[base.index() + index as usize].to_bits()
-            }
-            op => evaluate(op, |operand| values[operand.index()]).expect("elementary functions are expanded"),
+    let (values, _) = values.as_chunks_mut::<1>();
+    operations(func, 0..func.ops.len(), &[&*block], pool, values);
+    results(func, &mut [block], values);
+    func.status.map_or(0, |status| values[status.index()][0])
+}
+
+/// Evaluates some operations, in order, for as many blocks as there are, at most `N`; the last one stands for those that
+/// are missing.
+#[inline(always)]
+fn operations<const N: usize>(
+    func: &Func,
+    which: impl Iterator<Item = usize>,
+    blocks: &[impl Deref<Target = [f64]>],
+    pool: &[f64],
+    values: &mut [[u64; N]],
+) {
+    let block = |lane: usize| &*blocks[lane.min(blocks.len() - 1)];
+    for i in which {
+        let entry = |lane: usize, base: u32, len: u32, index: Value| {
+            base as usize + values[index.index()][lane].min(u64::from(len) - 1) as usize
+        };
+        values[i] = match func.ops[i] {
+            Op::Load(slot) => from_fn(|lane| block(lane)[slot.index()].to_bits()),
+            Op::Pool { base, len, index } => from_fn(|lane| pool[entry(lane, base, len, index)].to_bits()),
+            Op::Ring { base, len, index } => from_fn(|lane| block(lane)[entry(lane, base.0, len, index)].to_bits()),
+            op => evaluate_each(op, |operand| values[operand.index()]).expect("elementary functions are expanded"),
         };
     }
-    for (slot, value) in &func.stores {
-        block[slot.index()] = f64::from_bits(values[value.index()]);
+}
+
+/// Stores the results of a function.
+#[inline(always)]
+fn results<const N: usize>(func: &Func, blocks: &mut [&mut [f64]], values: &[[u64; N]]) {
+    for (lane, block) in blocks.iter_mut().enumerate() {
+        for (slot, value) in &func.stores {
+            block[slot.index()] = f64::from_bits(values[value.index()][lane]);
+        }
+        for write in &func.writes {
+            let index = values[write.index.index()][lane].min(u64::from(write.len) - 1);
+            block[write.base.index() + index as usize] = f64::from_bits(values[write.value.index()][lane]);
+        }
     }
-    for write in &func.writes {
-        let index = values[write.index.index()].min(u64::from(write.len) - 1);
-        block[write.base.index() + index as usize] = f64::from_bits(values[write.value.index()]);
-    }
-    func.status.map_or(0, |status| values[status.index()])
 }
 
 /// Runs a graph for a number of iterations and returns its status: the reference for the passes over graphs. It has no
@@ -245,6 +353,39 @@ impl Graph<'_> {
 mod tests {
     use super::*;
     use crate::ir::build::Build;
+    use crate::ir::random::{self, Random};
+
+    /// Random functions, on blocks that differ in every third slot, leave what running them once after the other leaves.
+    #[test]
+    fn blocks_at_once_end_as_each_alone() {
+        let mut invariant = 0;
+        for seed in 0..400 {
+            let mut random = Random(seed);
+            let len = 20 + random.below(80);
+            let func = random::func(&mut random, len);
+            let pool: Vec<f64> = (0..random::POOL_LEN).map(|_| random.real()).collect();
+            let start: Vec<f64> = (0..random::layout().size()).map(|_| random.real()).collect();
+            let (count, times) = (1 + random.below(2 * AT_ONCE), random.below(4));
+            let mut blocks = vec![start; count];
+            for block in &mut blocks {
+                block.iter_mut().skip(seed as usize % 3).step_by(3).for_each(|x| *x = random.real());
+            }
+            let mut expected = blocks.clone();
+            for block in &mut expected {
+                (0..times).for_each(|_| _ = run_once(&func, block, &pool));
+            }
+            let mut alone = blocks[0].clone();
+            run_while(&func, &mut alone, &pool, times, |_| ControlFlow::Continue(()));
+            run_each(&func, &mut blocks, &pool, times);
+            let bits = |block: &Vec<f64>| block.iter().map(|x| if x.is_nan() { 1 } else { x.to_bits() }).collect();
+            let [blocks, expected]: [Vec<Vec<u64>>; 2] = [blocks, expected].map(|all| all.iter().map(bits).collect());
+            assert_eq!(blocks, expected, "seed {seed}\n{func}");
+            assert_eq!(bits(&alone), expected[0], "seed {seed}\n{func}");
+            let residual = Residual::<1>::new(&func, &alone, &pool, |slot| slot.0 % 3 == 0);
+            invariant += func.ops.len() - residual.rest.len();
+        }
+        assert!(invariant > 2000, "{invariant}");
+    }
 
     #[test]
     fn loads_come_first_stores_last_and_a_status_stops() {
