@@ -103,7 +103,7 @@ def _whole(name: str, value: int | None, least: int, most: int) -> int | None:
 
 
 def _found(text: Text, names: Sequence[str], asked: _Asked, wished: _Wished) -> list[Fit]:
-    found, problems = text._inner.fit(list(names), asked, wished)
+    found, problems = _fric.fit(text._inner, list(names), asked, wished)
     for report in problems:
         import warnings
 

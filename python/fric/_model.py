@@ -288,7 +288,8 @@ class Text:
     ) -> Residuals:
         """Computed minus recorded as a function of the unknowns of a fit, compiled once: for other optimisers."""
         name = self._fit(name)
-        return Residuals(self._inner.residuals(name, _fit._asked(self, name, data, set, solver, step, tol, threads)))
+        asked = _fit._asked(self, name, data, set, solver, step, tol, threads)
+        return Residuals(_fric.residuals(self._inner, name, asked))
 
     def _fit(self, name: str | None) -> str:
         if name is None and len(self.fits) == 1:

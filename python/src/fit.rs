@@ -1,7 +1,8 @@
 //! Fits: their residuals at any values, and their answers.
 
+use crate::text::{self, Text};
 use crate::watched::{guarded, watched};
-use crate::{arrays, raise, text};
+use crate::{arrays, raise};
 use compiler::{Changes, Options};
 use fric::embed::{self, Compared, FitWishes, FoundFit, Problems, Unknown};
 use pyo3::exceptions::{PyOSError, PyValueError};
@@ -58,13 +59,15 @@ impl Wished {
 
 /// The answers of some fits of a text, the best law first if there are several; and the reports of those without an
 /// answer, unless there is only one, which raises.
-pub fn found(
+#[pyfunction]
+pub fn fit(
     py: Python,
-    text: &embed::Text,
-    names: &[String],
-    asked: &Asked,
+    text: &Text,
+    names: Vec<String>,
+    asked: Asked,
     wished: Wished,
 ) -> PyResult<(Vec<Found>, Vec<String>)> {
+    let text = text.inner();
     let (options, wishes) = (asked.options(py)?, wished.wishes());
     let work = |progress: &crate::watched::Progress| {
         let one = |name: &String| text.fit(name, &options, asked.tables.clone(), asked.threads, progress.stop());
@@ -95,20 +98,19 @@ pub struct Fit {
     fit: embed::Fit,
 }
 
-impl Fit {
-    /// The only law of a fit.
-    pub fn new(py: Python, text: &embed::Text, name: &str, asked: &Asked) -> PyResult<Fit> {
-        let options = asked.options(py)?;
-        let never = Arc::new(AtomicBool::new(false));
-        let compiled = || text.fit(name, &options, asked.tables.clone(), asked.threads, &never);
-        let mut fits = guarded(py, || py.detach(compiled))?.map_err(|found| raise::problems(py, &found))?;
-        if fits.len() > 1 {
-            let laws: Vec<&str> = fits.iter().map(embed::Fit::law).collect();
-            let laws = laws.join("; ");
-            return Err(PyValueError::new_err(format!("fit `{name}` has several laws: {laws}; fix one with set=")));
-        }
-        Ok(Fit { fit: fits.remove(0) })
+/// The only law of a fit, compiled.
+#[pyfunction]
+pub fn residuals(py: Python, text: &Text, name: &str, asked: Asked) -> PyResult<Fit> {
+    let options = asked.options(py)?;
+    let never = Arc::new(AtomicBool::new(false));
+    let compiled = || text.inner().fit(name, &options, asked.tables.clone(), asked.threads, &never);
+    let mut fits = guarded(py, || py.detach(compiled))?.map_err(|found| raise::problems(py, &found))?;
+    if fits.len() > 1 {
+        let laws: Vec<&str> = fits.iter().map(embed::Fit::law).collect();
+        let laws = laws.join("; ");
+        return Err(PyValueError::new_err(format!("fit `{name}` has several laws: {laws}; fix one with set=")));
     }
+    Ok(Fit { fit: fits.remove(0) })
 }
 
 fn described(unknowns: &[Unknown]) -> Vec<Described> {

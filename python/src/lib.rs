@@ -8,8 +8,8 @@ mod raise;
 mod arrays;
 mod arrow;
 mod watched;
-mod fit;
 mod text;
+mod fit;
 mod native;
 mod stepper;
 mod calls;
@@ -33,7 +33,7 @@ mod _fric {
     #[pymodule_export]
     use crate::batch::Batch;
     #[pymodule_export]
-    use crate::fit::{Fit, Found};
+    use crate::fit::{Fit, Found, fit, residuals};
     #[pymodule_export]
     use crate::native::Native;
     #[pymodule_export]

@@ -1,7 +1,7 @@
 //! Texts and their runs.
 
 use crate::watched::{guarded, watched};
-use crate::{arrays, fit, raise};
+use crate::{arrays, raise};
 use abi::description::{Kind, Quantity, Segment};
 use abi::plan::Method;
 use abi::unit::Unit;
@@ -50,22 +50,6 @@ impl Text {
 
     fn fits(&self) -> Vec<String> {
         self.text.fits()
-    }
-
-    /// The answers of some fits: see [`fit::found`].
-    fn fit(
-        &self,
-        py: Python,
-        names: Vec<String>,
-        asked: fit::Asked,
-        wished: fit::Wished,
-    ) -> PyResult<(Vec<fit::Found>, Vec<String>)> {
-        fit::found(py, &self.text, &names, &asked, wished)
-    }
-
-    /// A fit that is compiled, for residuals at any values.
-    fn residuals(&self, py: Python, name: &str, asked: fit::Asked) -> PyResult<fit::Fit> {
-        fit::Fit::new(py, &self.text, name, &asked)
     }
 
     fn models(&self) -> Vec<String> {

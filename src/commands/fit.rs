@@ -10,10 +10,10 @@ mod differences;
 pub mod after;
 pub mod answer;
 mod page;
+mod text;
 pub mod conclusion;
 pub mod laws;
 pub mod rank;
-mod text;
 mod of_laws;
 
 use super::{End, load, reported, sound};
