@@ -78,8 +78,9 @@ fn seconds(part: &compiler::fit::Part, starts: &[f64], runs: usize) -> f64 {
     least
 }
 
-/// What numba needs, in s: for a run of the moved contact, and for the differences of the stick-slip.
-fn numba(folder: &Path) -> Option<[f64; 2]> {
+/// What others need, in s: numba for a run of the moved contact; and for a Jacobian of the stick-slip numba, LSODA, and
+/// CVODES with two tolerances. NaN where a library is missing.
+fn others(folder: &Path) -> Option<[f64; 5]> {
     let python = std::env::var("FRIC_PYTHON").unwrap_or_else(|_| "python3".into());
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("benches/python/fit_loops.py");
     let output = Command::new(python).arg(script).arg(folder).output().ok()?;
@@ -116,10 +117,13 @@ fn main() {
 
     println!("moved contact, 4,001 rows, six unknowns: {:.4} ms a run in {lanes} lanes", 1e3 * run);
     println!("stick-slip, 30 s, 1,501 rows, four unknowns: {:.3} ms a Jacobian of nine runs", 1e3 * jacobian);
-    match numba(&folder) {
-        Some([loops, differences]) => {
+    match others(&folder) {
+        Some([loops, jacobians @ ..]) => {
             println!("numba: {:.4} ms a run, ratio {:.1}", 1e3 * loops, loops / run);
-            println!("numba: {:.3} ms a Jacobian, ratio {:.1}", 1e3 * differences, differences / jacobian);
+            let names = ["numba", "LSODA of SciPy", "CVODES of CasADi, tol 1e-6", "CVODES of CasADi, tol 1e-8"];
+            for (name, theirs) in names.iter().zip(jacobians) {
+                println!("{name}: {:.3} ms a Jacobian, ratio {:.1}", 1e3 * theirs, theirs / jacobian);
+            }
         }
         None => println!("numba is not there: no ratios"),
     }

@@ -987,7 +987,7 @@ fn presliding_is_identified_from_far_starts() {
     fs::write(folder.join("r.csv"), data).unwrap();
     let fit = format!(
         "fit f {{\n  run Tap(u = data.u)\n  data \"r.csv\" (t [s], u [N], x [um])\n  vary {}\n  minimise rms(x - data.x) / 0.1 um\n}}\n",
-        far(&mut chance, &BRISTLE)
+        far(&mut chance, &BRISTLE, 1.0)
     );
     fs::write(folder.join("f.fric"), format!("{MASSES}{fit}")).unwrap();
     holds(&folder, &BRISTLE, 1);
@@ -1009,7 +1009,7 @@ fn stick_slip_with_regimes_is_identified_from_far_starts() {
             fs::write(folder.join("r.csv"), "t [s],x [mm]\n".to_string() + &noisy.collect::<String>()).unwrap();
             let fit = format!(
                 "fit f {{\n  run Pull(fr = {contact}())\n  data \"r.csv\" (t [s], x [mm])\n  vary {}\n  minimise rms(x - data.x) / 2 mm\n}}\n",
-                far(&mut chance, &SLIP)
+                far(&mut chance, &SLIP, 1.0)
             );
             fs::write(folder.join("f.fric"), format!("{MASSES}{fit}")).unwrap();
             holds(&folder, &SLIP, seed);
@@ -1032,7 +1032,7 @@ fn a_maxwell_element_is_identified_from_far_starts() {
         fs::write(folder.join("r.csv"), recording(&noisy, &mut || 5e-3 * chance.normal())).unwrap();
         let fit = format!(
             "import std.friction\nfit f {{\n  run MaxwellElement(v = data.v)\n  data \"r.csv\" (t [s], v [m/s], F [N])\n  vary {}\n  minimise rms(F - data.F)\n}}\n",
-            far(&mut chance, &ELEMENT)
+            far(&mut chance, &ELEMENT, 1.0)
         );
         fs::write(folder.join("f.fric"), fit).unwrap();
         holds(&folder, &ELEMENT, seed);

@@ -68,21 +68,22 @@ pub fn made(folder: &Path, text: &str) -> Vec<Vec<f64>> {
     rows.lines().skip(1).map(cells).collect()
 }
 
-/// Unknowns with starts anywhere in ranges of a factor of ten each way, stiction above Coulomb friction.
-pub fn far(chance: &mut Chance, unknowns: &[Known]) -> String {
+/// Unknowns with starts anywhere in ranges of a factor 10^`decades` each way, stiction above Coulomb friction.
+pub fn far(chance: &mut Chance, unknowns: &[Known], decades: f64) -> String {
+    let factor = 10f64.powf(decades);
     let value = |starts: &[f64], name: &str| {
         let at = unknowns.iter().position(|(path, ..)| path.rsplit('.').next() == Some(name))?;
         Some(starts[at])
     };
     let starts: Vec<f64> = loop {
         let starts: Vec<f64> =
-            unknowns.iter().map(|(_, _, value)| value * 10f64.powf(2.0 * chance.fraction() - 1.0)).collect();
+            unknowns.iter().map(|(_, _, value)| value * 10f64.powf(decades * (2.0 * chance.fraction() - 1.0))).collect();
         if value(&starts, "Fs").zip(value(&starts, "Fc")).is_none_or(|(stiction, sliding)| stiction >= sliding) {
             break starts;
         }
     };
     let one = |((path, unit, value), start): (&Known, f64)| {
-        format!("{path} = {start:e} {unit} in {:e} {unit} .. {:e} {unit}", 0.1 * value, 10.0 * value)
+        format!("{path} = {start:e} {unit} in {:e} {unit} .. {:e} {unit}", value / factor, factor * value)
     };
     unknowns.iter().zip(starts).map(one).collect::<Vec<_>>().join(", ")
 }
