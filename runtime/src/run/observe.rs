@@ -72,6 +72,9 @@ impl Probe {
                 points.push(point);
             }
         }
+        if points.is_empty() {
+            return;
+        }
         let (begin, width) = (self.values.len(), self.slots.len());
         if self.values.capacity() - begin < width * points.len() {
             self.values.reserve(width * instants.len().min(ROOM).max(points.len()));
