@@ -76,8 +76,10 @@ pub fn far(chance: &mut Chance, unknowns: &[Known], decades: f64) -> String {
         Some(starts[at])
     };
     let starts: Vec<f64> = loop {
-        let starts: Vec<f64> =
-            unknowns.iter().map(|(_, _, value)| value * 10f64.powf(decades * (2.0 * chance.fraction() - 1.0))).collect();
+        let starts: Vec<f64> = unknowns
+            .iter()
+            .map(|(_, _, value)| value * 10f64.powf(decades * (2.0 * chance.fraction() - 1.0)))
+            .collect();
         if value(&starts, "Fs").zip(value(&starts, "Fc")).is_none_or(|(stiction, sliding)| stiction >= sliding) {
             break starts;
         }

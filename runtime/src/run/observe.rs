@@ -221,3 +221,43 @@ pub(crate) fn check_status(instance: &Instance, status: u64) -> Result<(), Stop>
     };
     Err(Stop { cause, time: instance.get(Slot::TIME) })
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::rng::Chance;
+
+    /// A stretch gives a probe the rows that its points give one after the other, whatever instants lie in it.
+    #[test]
+    fn a_stretch_is_probed_as_its_points_are() {
+        for seed in 1..200u64 {
+            let mut chance = Chance(seed);
+            let mut below = |n: u64| chance.below(n);
+            let slots: Vec<Slot> = (0..below(4)).map(|k| Slot(3 + k as u32)).collect();
+            let mut instants: Vec<f64> = (0..below(12)).map(|_| below(4000) as f64 / 100.0).collect();
+            instants.sort_by(f64::total_cmp);
+            let instants: Arc<[f64]> = instants.into();
+            let [mut alone, mut together] = [0, 1].map(|_| Probe::new(&instants, &slots));
+            let mut begin = 0;
+            while begin < 40 && !slots.is_empty() {
+                let len = 1 + below(7) as usize;
+                let value = |k: usize, point: usize| (10 * (begin + point) + k) as f64;
+                for point in 0..len {
+                    let mut block = vec![0.0; 3 + slots.len()];
+                    (0..slots.len()).for_each(|k| block[3 + k] = value(k, point));
+                    while alone.next().is_some_and(|instant| instant < (begin + point) as f64 + 0.5) {
+                        alone.take(&block);
+                    }
+                }
+                let mut stretch = Stretch::default();
+                let times = |times: &mut [f64]| times.iter_mut().enumerate().for_each(|(k, t)| *t = (begin + k) as f64);
+                let column = |k: usize, to: &mut [f64]| to.iter_mut().enumerate().for_each(|(at, x)| *x = value(k, at));
+                stretch.fill(len, &times, &slots, &column);
+                together.take_stretch(&stretch, 0.5);
+                begin += len;
+            }
+            assert_eq!(alone.passed, together.passed, "seed {seed}");
+            assert_eq!(alone.values(), together.values(), "seed {seed}");
+        }
+    }
+}
