@@ -41,29 +41,3 @@ impl Sources for Disk {
         }
     }
 }
-
-/// What a text names on disk, and one table that is in memory.
-pub struct WithTable {
-    /// The path by which the text names it.
-    pub path: &'static str,
-    /// Its content, as CSV.
-    pub table: String,
-}
-
-impl Sources for WithTable {
-    fn library(&self, module: &str) -> Option<Vec<(String, String)>> {
-        Disk.library(module)
-    }
-
-    fn modules(&self) -> Vec<String> {
-        Disk.modules()
-    }
-
-    fn library_is_sound(&self) -> bool {
-        Disk.library_is_sound()
-    }
-
-    fn file(&self, from: &str, path: &str) -> Result<(String, String), String> {
-        if path == self.path { Ok((path.into(), self.table.clone())) } else { Disk.file(from, path) }
-    }
-}

@@ -83,8 +83,10 @@ pub fn fit(
         Fault::Problems(found) => raise::problems(py, &found),
         Fault::Misused(why) => PyValueError::new_err(why),
     })?;
-    let made = |found: FoundFit| Found { unknowns: found.fit().unknowns(), compared: found.fit().compared(), found };
-    Ok((answers.into_iter().map(made).collect(), problems.into_iter().map(|one| one.report).collect()))
+    Ok((
+        answers.into_iter().map(|found| Found { found }).collect(),
+        problems.into_iter().map(|one| one.report).collect(),
+    ))
 }
 
 enum Fault {
@@ -113,23 +115,19 @@ pub fn residuals(py: Python, text: &Text, name: &str, asked: Asked) -> PyResult<
     Ok(Fit { fit: fits.remove(0) })
 }
 
-fn described(unknowns: &[Unknown]) -> Vec<Described> {
-    let one = |unknown: &Unknown| {
-        let Unknown { label, path, si, start, range } = unknown.clone();
-        (label, path, si, start, range)
-    };
-    unknowns.iter().map(one).collect()
+fn described(unknowns: Vec<Unknown>) -> Vec<Described> {
+    let one = |Unknown { label, path, si, start, range }| (label, path, si, start, range);
+    unknowns.into_iter().map(one).collect()
 }
 
 /// Label, SI unit and times of each compared quantity.
-fn labelled<'py>(py: Python<'py>, compared: &[Compared]) -> PyResult<Vec<(String, String, Bound<'py, PyAny>)>> {
-    let one =
-        |one: &Compared| Ok((one.label.clone(), one.si.clone(), arrays::fixed(py, one.times.clone())?.into_any()));
-    compared.iter().map(one).collect()
+fn labelled(py: Python, compared: Vec<Compared>) -> PyResult<Vec<(String, String, Bound<PyAny>)>> {
+    let one = |Compared { label, si, times }| Ok((label, si, arrays::fixed(py, times)?.into_any()));
+    compared.into_iter().map(one).collect()
 }
 
-fn columns<'py>(py: Python<'py>, columns: &[Vec<f64>]) -> PyResult<Vec<Bound<'py, PyAny>>> {
-    columns.iter().map(|column| Ok(arrays::fixed(py, column.clone())?.into_any())).collect()
+fn columns(py: Python, columns: Vec<Vec<f64>>) -> PyResult<Vec<Bound<PyAny>>> {
+    columns.into_iter().map(|column| Ok(arrays::fixed(py, column)?.into_any())).collect()
 }
 
 #[pymethods]
@@ -137,13 +135,13 @@ impl Fit {
     /// Label, path, SI unit, start and range of each unknown.
     #[getter]
     fn unknowns(&self) -> Vec<Described> {
-        described(&self.fit.unknowns())
+        described(self.fit.unknowns())
     }
 
     /// Label, SI unit and times of each compared quantity.
     #[getter]
     fn compared<'py>(&self, py: Python<'py>) -> PyResult<Vec<(String, String, Bound<'py, PyAny>)>> {
-        labelled(py, &self.fit.compared())
+        labelled(py, self.fit.compared())
     }
 
     /// The residuals at these values of all unknowns, in SI.
@@ -156,15 +154,13 @@ impl Fit {
             )));
         }
         let found = guarded(py, || py.detach(|| self.fit.residuals(&values)))?;
-        columns(py, &found.map_err(|why| raise::run_error(py, &why, f64::NAN, None))?)
+        columns(py, found.map_err(|why| raise::run_error(py, &why, f64::NAN, None))?)
     }
 }
 
 /// A fit with its answer.
 #[pyclass(frozen, module = "fric._fric")]
 pub struct Found {
-    unknowns: Vec<Unknown>,
-    compared: Vec<Compared>,
     found: FoundFit,
 }
 
@@ -173,13 +169,13 @@ impl Found {
     /// Label, path, SI unit, start and range of each unknown.
     #[getter]
     fn unknowns(&self) -> Vec<Described> {
-        described(&self.unknowns)
+        described(self.found.fit().unknowns())
     }
 
     /// Label, SI unit and times of each compared quantity.
     #[getter]
     fn compared<'py>(&self, py: Python<'py>) -> PyResult<Vec<(String, String, Bound<'py, PyAny>)>> {
-        labelled(py, &self.compared)
+        labelled(py, self.found.fit().compared())
     }
 
     /// Values in SI.
@@ -197,14 +193,14 @@ impl Found {
     /// Correlations, of shape (unknowns, unknowns).
     #[getter]
     fn correlation<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
-        let n = self.unknowns.len();
+        let n = self.found.values().len();
         arrays::array(py, self.found.correlation().to_vec(), Some(&[n, n]))
     }
 
     /// Compared minus recorded, in SI.
     #[getter]
     fn residuals<'py>(&self, py: Python<'py>) -> PyResult<Vec<Bound<'py, PyAny>>> {
-        columns(py, &self.found.residuals())
+        columns(py, self.found.residuals())
     }
 
     #[getter]

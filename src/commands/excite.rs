@@ -8,7 +8,7 @@ use super::fit::search::Runs;
 use super::{End, load, load_text, reported, sound};
 use crate::args;
 use crate::compile::{self, ElementaryFunction, Loaded, Options, Stopwatch, Unary};
-use crate::disk::WithTable;
+use crate::named_files::NamedFiles;
 use crate::project;
 use crate::quantity::{self, count, duration, show, significant};
 use crate::terminal::{Style, Terminal};
@@ -443,8 +443,8 @@ fn designed(args: &args::Excite, terminal: &mut Terminal) -> Result<End, (String
     for k in 0..=rows as usize {
         let _ = writeln!(table, "{:?}{}", k as f64 / args.rate, ";0".repeat(columns));
     }
-    let sources = WithTable { path: TABLE, table };
     let place = args.file.display().to_string();
+    let sources = NamedFiles::new(vec![(place.clone(), TABLE.into(), TABLE.into(), table)]);
     let mut changed = load_text(&place, &text, &sources, terminal, &mut watch).ok_or_else(|| failed(""))?;
     let compiled = match compile::fit(&mut changed, &sources, &name, &Options::default(), &mut Vec::new()) {
         Ok(compiled) => compiled.into_iter().next().expect("it has been compiled"),

@@ -7,7 +7,7 @@ mod kept;
 pub mod search;
 #[cfg(test)]
 mod differences;
-pub mod after;
+mod after;
 pub mod answer;
 mod page;
 mod text;
@@ -177,7 +177,6 @@ fn alternatives(
 ) -> End {
     let mut tried = Vec::new();
     for fit in all {
-        let begin = Instant::now();
         let mut runs = Runs::new(fit, args.threads);
         runs.keep(kept.clone());
         if args.check {
@@ -189,10 +188,7 @@ fn alternatives(
             }
             continue;
         }
-        let found = search(&runs, Settings::of(args));
-        let held_out = found.as_ref().ok().and_then(|found| after::held_out(&runs, found, Settings::of(args)));
-        let (name, law) = (name.to_string(), runs.label.clone());
-        tried.push(rank::Tried { name, law, runs, found, held_out, seconds: begin.elapsed().as_secs_f64() });
+        tried.push(rank::Tried::new(name, runs, Settings::of(args)));
     }
     if args.check {
         return End::Fine;

@@ -6,8 +6,8 @@
 use super::{Problems, Text, without_effect};
 use crate::commands::fit::conclusion::{Asked, Conclusion, Wishes, recordings, told};
 use crate::commands::fit::rank::{self, Tried};
-use crate::commands::fit::search::{Runs, search};
-use crate::commands::fit::{after, answer, laws as standard};
+use crate::commands::fit::search::{Found, Part, Runs, search};
+use crate::commands::fit::{answer, laws as standard};
 use crate::compile::{self, Loaded, Options, Sources};
 use crate::disk::Disk;
 use crate::named_files::NamedFiles;
@@ -128,7 +128,7 @@ impl Fit {
 
     /// What is compared, in the order of all residuals.
     pub fn compared(&self) -> Vec<Compared> {
-        let of = |part: &crate::commands::fit::search::Part| {
+        let of = |part: &Part| {
             let before = if self.runs.parts.len() > 1 { format!("{}: ", part.asks.label) } else { String::new() };
             let one = |item: &compile::FitItem| {
                 let rows = item.kept(&part.instants).into_iter();
@@ -147,18 +147,18 @@ impl Fit {
     /// # Errors
     /// Why the model cannot be run with them, in words.
     pub fn residuals(&self, values: &[f64]) -> Result<Vec<Vec<f64>>, String> {
-        self.runs.residuals(Way::Whole, values, &self.runs.steps()).map(|found| self.as_recorded(&found))
+        self.runs.residuals(Way::Whole, values, &self.runs.steps()).map(|found| self.as_recorded(found))
     }
 
     /// Residuals in the order of the rows in the file: steady points are run in another one.
-    fn as_recorded(&self, residuals: &[Vec<f64>]) -> Vec<Vec<f64>> {
-        let mut out = residuals.to_vec();
+    fn as_recorded(&self, mut residuals: Vec<Vec<f64>>) -> Vec<Vec<f64>> {
         for (part, items) in self.runs.parts.iter().zip(self.runs.items()) {
-            for k in items.filter(|_| part.asks.steady) {
-                part.asks.points.iter().zip(&residuals[k]).for_each(|(row, value)| out[k][*row] = *value);
+            for column in residuals[items].iter_mut().filter(|_| part.asks.steady) {
+                let held = column.clone();
+                part.asks.points.iter().zip(held).for_each(|(row, value)| column[*row] = value);
             }
         }
-        out
+        residuals
     }
 
     /// Searches for the values, and answers what is wished beside them.
@@ -196,13 +196,8 @@ impl Fit {
 /// come as problems.
 pub fn ranked(fits: Vec<Fit>, wishes: &Wishes) -> (Vec<FoundFit>, Vec<Problems>) {
     let one = |fit: Fit| {
-        let begin = Instant::now();
         let Fit { loaded, name, runs, tables, given } = fit;
-        let found = search(&runs, wishes.settings);
-        let held_out = found.as_ref().ok().and_then(|found| after::held_out(&runs, found, wishes.settings));
-        let law = if runs.label.is_empty() { runs.parts[0].asks.model.clone() } else { runs.label.clone() };
-        let seconds = begin.elapsed().as_secs_f64();
-        (Tried { name, law, runs, found, held_out, seconds }, (loaded, tables, given))
+        (Tried::new(&name, runs, wishes.settings), (loaded, tables, given))
     };
     let (tried, mut others): (Vec<Tried>, Vec<_>) = fits.into_iter().map(one).map(|(a, b)| (a, Some(b))).unzip();
     let order = rank::order(&tried);
@@ -237,7 +232,7 @@ pub struct FoundFit {
 impl FoundFit {
     fn new(
         fit: Fit,
-        found: crate::commands::fit::search::Found,
+        found: Found,
         wishes: &Wishes,
         rank: Option<&answer::Rank>,
         seconds: f64,
@@ -281,7 +276,7 @@ impl FoundFit {
 
     /// Compared minus recorded, in SI, in the order of [`Fit::compared`].
     pub fn residuals(&self) -> Vec<Vec<f64>> {
-        self.fit.as_recorded(&self.conclusion.fitted.answer.residuals)
+        self.fit.as_recorded(self.conclusion.fitted.answer.residuals.clone())
     }
 
     /// The length of the steps of each recording, of adaptive runs their tolerance.

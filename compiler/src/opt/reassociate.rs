@@ -146,7 +146,7 @@ struct Affine {
     state: Value,
     /// Whether x enters more than once.
     repeated: bool,
-    /// Number of operations on the longest way from x.
+    /// Number of operations on the longest path from x.
     links: u32,
 }
 

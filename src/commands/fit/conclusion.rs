@@ -206,7 +206,7 @@ impl Conclusion {
     }
 }
 
-/// The name of the files of one recording, without ending.
+/// The stem of the files that are written of one recording.
 fn stem(name: &str, runs: &Runs, part: &Part) -> String {
     if runs.parts.len() > 1 { format!("{name}_{}", part.asks.label) } else { name.to_string() }
 }

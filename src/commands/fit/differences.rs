@@ -5,7 +5,7 @@
 
 use super::search::{Runs, Settings, Stepped, estimate};
 use crate::compile::{self, Options};
-use crate::disk::WithTable;
+use crate::named_files::NamedFiles;
 use runtime::fit::{Tile, Way};
 use std::f64::consts::{PI, TAU};
 
@@ -49,7 +49,7 @@ impl runtime::fit::Runs for Watched<'_> {
 
 /// The differences of all Jacobians of a search from the written start.
 fn differences(text: &str, data: String) -> Vec<Vec<Pair>> {
-    let sources = WithTable { path: "r.csv", table: data };
+    let sources = NamedFiles::new(vec![("f.fric".into(), "r.csv".into(), "r.csv".into(), data)]);
     let mut loaded = compile::load("f.fric", text, &sources);
     let compiled = compile::fit(&mut loaded, &sources, "f", &Options::default(), &mut Vec::new());
     let compiled = compiled.unwrap_or_else(|errors| panic!("{errors:?}"));

@@ -2,14 +2,13 @@
 
 use super::kept::Keeping;
 use super::rank::{self, Heading, Tried};
-use super::search::{Runs, Settings, search};
-use super::{after, chosen, laws};
+use super::search::{Runs, Settings};
+use super::{chosen, laws};
 use crate::args;
 use crate::commands::{End, load_text, reported};
 use crate::compile::{self, Changes, Options, Sources, Stopwatch};
 use crate::project;
 use crate::terminal::Terminal;
-use std::time::Instant;
 
 /// `fric fit FILE.csv`: fits the standard laws, ranks them by what they predict, and shows the best one.
 pub fn of_laws(args: &args::Fit, terminal: &mut Terminal) -> End {
@@ -64,14 +63,10 @@ pub fn of_laws(args: &args::Fit, terminal: &mut Terminal) -> End {
                 return End::Failed;
             }
         };
-        let begin = Instant::now();
         // A fit of a law has no alternatives.
         let mut runs = Runs::new(compiled.into_iter().next().expect("it has been compiled"), args.threads);
         runs.keep(kept);
-        let found = search(&runs, Settings::of(args));
-        let held_out = found.as_ref().ok().and_then(|found| after::held_out(&runs, found, Settings::of(args)));
-        let law = runs.parts[0].asks.model.clone();
-        tried.push(Tried { name, law, runs, found, held_out, seconds: begin.elapsed().as_secs_f64() });
+        tried.push(Tried::new(&name, runs, Settings::of(args)));
     }
     let heading = Heading { title: &name, wrote: Some(&place) };
     let end = rank::rank(args, &heading, (&place, &[]), &loaded, &tried, terminal);

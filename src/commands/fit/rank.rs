@@ -5,7 +5,7 @@
 
 use super::answer::Rank;
 use super::conclusion::{Asked, recordings, told};
-use super::search::{Found, Runs};
+use super::search::{Found, Runs, Settings, search};
 use super::{after, conclude};
 use crate::args;
 use crate::commands::{End, reported};
@@ -15,6 +15,7 @@ use crate::terminal::Terminal;
 use runtime::fit::ranking::{self, Contender, Paired};
 use runtime::fit::{Residuals, Trouble};
 use std::path::Path;
+use std::time::Instant;
 
 /// A law that has been fitted.
 pub struct Tried {
@@ -30,6 +31,17 @@ pub struct Tried {
     pub held_out: Option<Residuals>,
     /// Time of the search in s.
     pub seconds: f64,
+}
+
+impl Tried {
+    /// Searches for the values of a law, and for what it leaves of rows that it has not seen.
+    pub fn new(name: &str, runs: Runs, settings: Settings) -> Tried {
+        let begin = Instant::now();
+        let found = search(&runs, settings);
+        let held_out = found.as_ref().ok().and_then(|found| after::held_out(&runs, found, settings));
+        let law = if runs.label.is_empty() { runs.parts[0].asks.model.clone() } else { runs.label.clone() };
+        Tried { name: name.into(), law, runs, found, held_out, seconds: begin.elapsed().as_secs_f64() }
+    }
 }
 
 /// What stands above the table, and the file of all laws, if one was written.
@@ -80,7 +92,7 @@ pub fn rank(
     end
 }
 
-/// The laws in their order: the number of each, and its place.
+/// The laws, the best first: the index of each in `tried`, and its rank.
 pub fn order(tried: &[Tried]) -> Vec<(usize, Rank)> {
     let steady = tried.first().is_some_and(|one| one.runs.parts[0].asks.steady);
     let contenders = contenders(tried);
