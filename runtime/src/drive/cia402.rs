@@ -22,6 +22,9 @@ const MODE: Object = Object(0x6060, 0);
 const MODE_SHOWN: Object = Object(0x6061, 0);
 const ERROR: Object = Object(0x603F, 0);
 
+/// Longest time between two guard requests, ms.
+const GUARD_MS_MAX: u32 = 200;
+
 /// Period of a drive's heartbeat.
 pub const HEARTBEAT_MS: u64 = 20;
 /// Shortest time after which a heartbeat counts as missing: two and a half periods. A longer `watchdog` of the rig
@@ -669,9 +672,16 @@ impl Drive {
     /// Sends a guard request, if the drive is monitored by node guarding.
     pub(super) fn guard(&mut self, now_ns: u64, send: Send) {
         if self.watching == Some(Watching::Guarding) && now_ns >= self.guard_due_ns {
-            self.guard_due_ns = now_ns + u64::from(self.timeout_wanted_ms().div_ceil(3).max(1)) * 1_000_000;
+            // Its answers are also all that tells its NMT state: soon enough for the start-up.
+            let apart_ms = self.timeout_wanted_ms().div_ceil(3).clamp(1, GUARD_MS_MAX);
+            self.guard_due_ns = now_ns + u64::from(apart_ms) * 1_000_000;
             send(service::guard_request(self.config.node));
         }
+    }
+
+    /// Makes the next guard request due.
+    pub(super) fn guard_now(&mut self) {
+        self.guard_due_ns = 0;
     }
 
     /// One step of the identification. Also polls the SDO client for time-outs.

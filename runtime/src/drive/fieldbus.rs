@@ -501,6 +501,10 @@ impl Fieldbus {
         self.done.fill(false);
         self.wanted.fill(0.0);
         (self.push, self.returns_ns, self.off_since_ns) = (None, 0, None);
+        // A drive monitors us only from our first life sign after its configuration on (CiA 301). With a long watchdog the
+        // next regular one might come when it is enabled already, or after the time-out test.
+        self.heartbeat_due_ns = 0;
+        self.nodes.iter_mut().filter_map(drive_of_mut).for_each(Drive::guard_now);
     }
 
     fn aim(&mut self, goal: Goal, resets: bool) {

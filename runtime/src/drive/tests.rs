@@ -7,7 +7,9 @@ use crate::can::Frame;
 use crate::canopen::object::Entry;
 use crate::canopen::{Access, NmtState, Object, Service, Type};
 use crate::drive::fault_injection::{self, Hook, Start};
+use crate::rng::Chance;
 use crate::testing::drives::*;
+use crate::testing::generated::seeds;
 use abi::rig::{Kind, Mode, Rig, SignalKind};
 
 fn table(rig: &Rig) -> Table {
@@ -290,6 +292,34 @@ fn a_drive_that_ignores_our_missing_heartbeat_is_refused() {
     );
 }
 
+/// However long the watchdog is, and however soon the operator enables: a drive counts from our first life sign after its
+/// configuration, and that must come before the drive has torque.
+#[test]
+fn a_drive_monitors_us_before_it_is_enabled() {
+    for seed in seeds(24) {
+        println!("FRIC_SEED={seed} repeats it");
+        let mut chance = Chance(seed);
+        let mut rig = if seed % 3 == 0 { converter() } else { rig(Mode::Torque) };
+        let most_ms = [1_000, 10_000][chance.below(2) as usize];
+        rig.watchdog_ns = (100 + chance.below(most_ms - 99)) * 1_000_000;
+        let steady_ns = chance.below(3_000) * 1_000_000;
+        let mut table = Table::new(&rig, Some(shaft(0.012, 0.001)), Options { steady_ns, ..Options::default() });
+        table.until(Step::AwaitEnable);
+        table.ticks(chance.below(3_000) as usize);
+        assert!(table.fieldbus.request(Request::Enable));
+        table.until(Step::TimeoutTest);
+        table.until(Step::Reenable);
+        for node in 0..rig.nodes.len() {
+            let Some(status) = table.fieldbus.status(node) else { continue };
+            let (limit_ms, _) = status.timeout.expect("it monitors us");
+            let measured_ms = status.timeout_measured_ns.expect("tested") / 1_000_000;
+            // Not the distance of two life signs less: the last one is sent when the test begins.
+            let least_ms = u64::from(limit_ms).saturating_sub(55);
+            assert!(measured_ms >= least_ms, "seed {seed}: {measured_ms} ms instead of {limit_ms} ms");
+        }
+    }
+}
+
 #[test]
 fn another_master_is_refused_or_reported() {
     for (id, at_start) in [(0x080, true), (0x000, true), (0x603, true), (0x705, true), (0x204, true), (0x080, false)] {
@@ -475,8 +505,8 @@ fn a_simulated_vlt_has_its_scale_and_refresh() {
     assert_eq!(table.fieldbus.status(SERVO).unwrap().timeout.unwrap().0, 1000, "the least it can");
 }
 
-#[test]
-fn a_converter_of_the_fc302_kind_uses_node_guarding() {
+/// One drive whose profile has node guarding alone.
+fn converter() -> Rig {
     let mut rig = rig(Mode::Speed);
     rig.nodes.remove(SERVO);
     rig.outputs.truncate(1);
@@ -486,6 +516,12 @@ fn a_converter_of_the_fc302_kind_uses_node_guarding() {
     let own = config(&mut rig, 0);
     own.profile = "fc302".to_string();
     own.speed_unit = std::f64::consts::PI / 30.0;
+    rig
+}
+
+#[test]
+fn a_converter_of_the_fc302_kind_uses_node_guarding() {
+    let rig = converter();
     let mut table = table(&rig);
     table.arm();
     let status = table.fieldbus.status(0).unwrap();
