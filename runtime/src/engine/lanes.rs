@@ -28,17 +28,39 @@ pub enum Next<T> {
 const MOST: u64 = 4096;
 const PART: u64 = 16;
 
-/// The values of some slots after each of a few steps: step by step, slot by slot, lane by lane.
-struct Series<'r> {
-    slots: &'r [Slot],
-    rows: &'r [f64],
+/// Most steps between two looks at a run that reads each of them.
+const ROWS: u64 = 128;
+
+/// What runs that read every step read: the values of some slots after each of the last steps, step by step, slot by slot,
+/// lane by lane. A run reads its steps when it is looked at, however many there are by then.
+struct Series {
+    /// The slots; all such runs read the same, because they have the same plan.
+    slots: Vec<Slot>,
+    rows: Vec<f64>,
+    /// The rows of the last call.
+    latest: Vec<f64>,
     width: usize,
+    /// The common step count before the first row.
+    first: u64,
 }
 
-impl Series<'_> {
-    /// Writes the values of a slot in one lane after each of the first steps.
-    fn read(&self, slot: usize, lane: usize, column: &mut [f64]) {
-        copy_column(&self.rows[slot * self.width + lane..], self.slots.len() * self.width, column);
+impl Series {
+    /// Makes some steps and adds a row for each; returns their number.
+    fn advance(&mut self, batch: &mut Batch, pool: &[f64], count: u64) -> u64 {
+        let done = batch.advance_and_read(pool, count, &self.slots, &mut self.latest);
+        self.latest.truncate(done as usize * self.slots.len() * self.width);
+        match self.rows.is_empty() {
+            true => std::mem::swap(&mut self.rows, &mut self.latest),
+            false => self.rows.extend_from_slice(&self.latest),
+        }
+        done
+    }
+
+    /// Writes the values of a slot in one lane after each of the first steps since a step count.
+    fn read(&self, since: u64, slot: usize, lane: usize, column: &mut [f64]) {
+        let row = self.slots.len() * self.width;
+        let begin = (since - self.first) as usize * row + slot * self.width + lane;
+        copy_column(&self.rows[begin..], row, column);
     }
 }
 
@@ -79,8 +101,7 @@ pub(crate) struct Together<T> {
     total: u64,
     /// Whether there may be further runs.
     more: bool,
-    /// What the last series read.
-    rows: Vec<f64>,
+    series: Series,
 }
 
 impl<T> Together<T> {
@@ -89,7 +110,9 @@ impl<T> Together<T> {
         let batch = Batch::new(lanes.clone());
         let all = (0..batch.width()).map(|_| None).collect();
         let astray = vec![true; batch.width()];
-        Together { batch, all, astray, pool: None, calm: 0, total: 0, more: true, rows: Vec::new() }
+        let [rows, latest] = [(); 2].map(|()| Vec::new());
+        let series = Series { slots: Vec::new(), rows, latest, width: batch.width(), first: 0 };
+        Together { batch, all, astray, pool: None, calm: 0, total: 0, more: true, series }
     }
 
     /// The runs in progress.
@@ -105,7 +128,7 @@ impl<T> Together<T> {
         give: &mut Give<T>,
         watch: &mut dyn FnMut(f64) -> Continue,
     ) -> bool {
-        let Together { batch, all, astray, pool, calm, total, more, rows } = self;
+        let Together { batch, all, astray, pool, calm, total, more, series } = self;
         let stride = (*calm / PART).clamp(1, MOST);
         for lane in 0..all.len() {
             while *more && all[lane].is_none() {
@@ -130,15 +153,24 @@ impl<T> Together<T> {
         let next = all.iter().flatten().map(|lane| lane.until).min().expect("there is one");
         let course = &mut all[model].as_mut().expect("there is one").course;
         let pool = pool.get_or_insert_with(|| course.instance().description().pool.clone());
-        // Runs that read every step read the same slots, because they have the same plan.
-        let seen = all.iter().flatten().find_map(|lane| Some(lane.course.series()?.0.to_vec()));
         let count = (next - *total).min(stride);
-        let done = match &seen {
-            Some(slots) => batch.advance_and_read(pool, count, slots, rows),
+        let unread = all.iter().flatten().filter(|lane| lane.reads_each).map(|lane| lane.since).min();
+        let done = match unread {
+            Some(since) => {
+                if series.slots.is_empty() {
+                    let slots = all.iter().flatten().find_map(|lane| Some(lane.course.series()?.0.to_vec()));
+                    series.slots = slots.expect("a run reads them");
+                }
+                if since == *total {
+                    series.first = since;
+                    series.rows.clear();
+                }
+                series.advance(batch, pool, count.min(ROWS - (*total - series.first)))
+            }
             None => batch.advance(pool, count),
         };
-        let series = Series { slots: seen.as_deref().unwrap_or_default(), rows, width: batch.width() };
         *total += done;
+        let is_full = unread.is_some() && *total - series.first == ROWS;
         let mut looked = false;
         for (number, place) in all.iter_mut().enumerate() {
             let status = batch.status(number);
@@ -146,11 +178,11 @@ impl<T> Together<T> {
                 astray[number] |= status != 0;
                 continue;
             };
-            if status == 0 && lane.until > *total && lane.course.series().is_none() {
+            if status == 0 && lane.until > *total && !(lane.reads_each && is_full) {
                 continue;
             }
             looked |= status != 0;
-            if let Some(result) = lane.look(batch, (number, *total), status, &series, watch) {
+            if let Some(result) = lane.look(batch, (number, *total), status, series, watch) {
                 let lane = place.take().expect("it was there");
                 astray[number] = true;
                 give(lane.tag, lane.course.rest(), result);
@@ -168,6 +200,8 @@ struct Lane<T> {
     /// The common step count at which the run was last inspected, and the one at which it must be inspected next.
     since: u64,
     until: u64,
+    /// Whether it has a series now.
+    reads_each: bool,
 }
 
 /// Loads a run into a lane at this step count; none if it has already ended.
@@ -194,7 +228,8 @@ fn begin<T>(
         Ok(Some(left)) => {
             batch.load(number, course.instance().block());
             let until = total.saturating_add(calls(&*course, left));
-            Some(Lane { tag, course, since: total, until })
+            let reads_each = course.series().is_some();
+            Some(Lane { tag, course, since: total, until, reads_each })
         }
         result => {
             give(tag, course.rest(), result.map(|_| ()));
@@ -214,12 +249,11 @@ impl<T> Lane<T> {
         series: &Series,
         watch: &mut dyn FnMut(f64) -> Continue,
     ) -> Option<Result<(), Stop>> {
-        let done = total - std::mem::replace(&mut self.since, total);
-        // The observer reads all steps of a series but the last one here. It reads the last one from the block, once that
-        // holds the other slots of the step too.
+        let since = std::mem::replace(&mut self.since, total);
+        let done = total - since;
         if let Some((slots, _)) = self.course.series() {
             assert_eq!(slots, series.slots, "all runs in lanes read the same slots");
-            if let Err(stop) = self.course.show(done - 1, &|slot, column| series.read(slot, number, column)) {
+            if let Err(stop) = self.course.show(done, &|slot, column| series.read(since, slot, number, column)) {
                 return Some(Err(stop));
             }
         }
@@ -230,6 +264,7 @@ impl<T> Lane<T> {
         match self.course.next(watch) {
             Ok(Some(left)) => {
                 self.until = total.saturating_add(calls(&*self.course, left));
+                self.reads_each = self.course.series().is_some();
                 self.course.bring(&mut |slots, block| batch.load_part(number, slots, block));
                 None
             }

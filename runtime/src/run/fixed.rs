@@ -190,7 +190,8 @@ impl Stepper for Fixed {
         // The block may be that before the calls or after them.
         let (first, step) = ((work.steps + self.done + 1) as f64, self.step);
         let times = |times: &mut [f64]| multiples(first, step, times);
-        self.stretch.fill(calls as usize, &times, &self.series, column);
+        // The last one is read from the block, once that holds the other slots of the step too.
+        self.stretch.fill(calls as usize - 1, &times, &self.series, column);
         if self.probes {
             observer.probe.take_stretch(&self.stretch, 0.5 * step);
             return Ok(());

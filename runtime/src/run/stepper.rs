@@ -19,13 +19,13 @@ pub(crate) trait Stepper: Send {
     fn next(&mut self, watch: &mut dyn FnMut(f64) -> Continue) -> Result<Option<u64>, Stop>;
 
     /// If this run reads its block after every call: the slots that it reads, apart from time, and how many calls may be made
-    /// before [`take`](Stepper::take) if [`show`](Stepper::show) receives those slots after each call but the last.
+    /// before [`take`](Stepper::take) if [`show`](Stepper::show) receives those slots after each call.
     fn series(&self) -> Option<(&[Slot], u64)> {
         None
     }
 
-    /// Receives such values: those after the first `calls` calls since the last `take`. All of these have returned 0.
-    /// `column` writes the values of the slot with a given number after each of the calls.
+    /// Receives such values: those after the `calls` calls since the last `take`. All but the last of these have returned
+    /// 0. `column` writes the values of the slot with a given number after each of the first calls.
     fn show(&mut self, _calls: u64, _column: &dyn Fn(usize, &mut [f64])) -> Result<(), Stop> {
         unreachable!("it has no series")
     }
@@ -92,13 +92,34 @@ pub(crate) fn until(
     Ok(false)
 }
 
-/// Makes the calls of a series in one, if there is code that records the slots, and shows all but the last. Returns their
-/// number and the last status.
+/// Makes the calls of a series and shows them: in one call, if there is code that records the slots. Returns their number and
+/// the last status. None where a single call is as good: a fixed step without such code.
 fn in_series(course: &mut dyn Stepper, rows: &mut Vec<f64>) -> Result<Option<(u64, u64)>, Stop> {
+    let function = course.function();
     let Some((slots, most)) = course.series() else { return Ok(None) };
     let slots = slots.to_vec();
     rows.resize(most as usize * slots.len(), 0.0);
-    let Some((done, status)) = course.instance().advance_recording(&slots, rows, most) else { return Ok(None) };
-    course.show(done - 1, &|slot, column| copy_column(&rows[slot..], slots.len(), column))?;
+    let instance = course.instance();
+    let made = match function {
+        Function::Step => instance.advance_recording(&slots, rows, most),
+        _ => Some(by_calls(instance, function, &slots, rows)),
+    };
+    let Some((done, status)) = made else { return Ok(None) };
+    course.show(done, &|slot, column| copy_column(&rows[slot..], slots.len(), column))?;
     Ok(Some((done, status)))
+}
+
+/// Calls a function for each row, up to the first status that is not 0, and writes the values of the slots to the row.
+/// Returns the number of calls and the last status.
+fn by_calls(instance: &mut Instance, function: Function, slots: &[Slot], rows: &mut [f64]) -> (u64, u64) {
+    let (mut done, mut status) = (0, 0);
+    for row in rows.chunks_exact_mut(slots.len()) {
+        status = instance.call(function);
+        row.iter_mut().zip(slots).for_each(|(value, slot)| *value = instance.get(*slot));
+        done += 1;
+        if status != 0 {
+            break;
+        }
+    }
+    (done, status)
 }

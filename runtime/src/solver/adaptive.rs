@@ -10,7 +10,7 @@
 mod kinks;
 
 use super::explicit::Explicit;
-use super::fused::{Fused, Judged, Pace};
+use super::fused::{Fused, Judged, Pace, Settled};
 use super::jacobian::Entries;
 use super::points::Points;
 use super::rosenbrock::Rosenbrock;
@@ -124,6 +124,10 @@ pub(crate) struct Adaptive {
     suspect: f64,
     /// Whether the model's own function reports that the step meets a surface.
     met: bool,
+    /// Whether that function leaves each step open for attention.
+    attends: bool,
+    /// Where it leaves the steps that it accepts by itself, if observers need them.
+    series: Option<Settled>,
     /// Whether anything in the block outside the trial may have changed since the last call.
     moved: bool,
     /// Whether no step has been made since the last restart.
@@ -231,6 +235,7 @@ impl Adaptive {
             jacobian: vec![0.0; entries.len() + n],
             rosenbrock: Rosenbrock::new(n, entries.coupled()),
             entries,
+            series: fused.as_ref().filter(|_| points.are_shown()).map(|fused| Settled::new(fused.trial)),
             fused,
             fine,
             was_fused: false,
@@ -253,6 +258,7 @@ impl Adaptive {
             followed: None,
             suspect: f64::INFINITY,
             met: false,
+            attends: false,
             moved: true,
             fresh: true,
             events: VecDeque::new(),
@@ -318,7 +324,7 @@ impl Adaptive {
     }
 
     /// Writes the inputs of the model's own step function into the block. That function accepts or rejects steps by
-    /// itself as long as they are ordinary: no special step is in progress, and no observer needs each step.
+    /// itself as long as they are ordinary: no special step is in progress, and no surface of observers is to be found.
     fn prepare(&mut self, stop: f64) -> u64 {
         self.know_slope();
         if self.fused.as_ref().is_some_and(|fused| !fused.ready) {
@@ -330,8 +336,9 @@ impl Adaptive {
             || self.creep.is_finite()
             || self.usual.is_some()
             || self.suspect.is_finite()
-            || self.points.are_shown()
+            || self.points.are_shown() && self.observed.any()
             || self.aimed.iter().any(|aimed| *aimed > 0);
+        self.attends = attend;
         let fused = self.fused.as_mut().expect("asked before");
         if !fused.ready {
             fused.begin(&mut self.system, &self.x, &self.step.f0, &self.jacobian);
@@ -341,7 +348,23 @@ impl Adaptive {
         let (lengths, watched) = ((stop, self.longest), self.points.next_probe());
         fused.prepare(&mut self.system, pace, lengths, watched, attend, &self.scales);
         fused.prepare_surfaces(&mut self.system, self.surfaces.sides(), self.surfaces.here());
-        if attend { 1 } else { WATCHED - self.attempts() % WATCHED }
+        if attend { 1 } else { self.until_watched() }
+    }
+
+    /// Number of attempts to the next call of the progress callback.
+    fn until_watched(&self) -> u64 {
+        WATCHED - self.attempts() % WATCHED
+    }
+
+    /// Counts attempts of the model's own step function: those that it has accepted and rejected, and one that it has left
+    /// open.
+    fn count(&mut self, accepted: u64, refused: u64, is_open: bool) {
+        self.work.steps += accepted;
+        self.work.stiff_steps += accepted;
+        self.work.rejected += refused;
+        let trials = accepted + refused + u64::from(is_open);
+        self.work.jacobians += trials;
+        self.system.evaluations += 8 * trials;
     }
 
     /// Attempts a step with the general routines and evaluates it.
@@ -588,7 +611,7 @@ impl Adaptive {
 
     /// Shows the step up to θ, whose point has the time `time`, with both sides of each surface at which observed
     /// quantities change.
-    fn show(&mut self, theta: f64, time: f64) -> Result<(), Stop> {
+    fn show_until(&mut self, theta: f64, time: f64) -> Result<(), Stop> {
         if self.observed.any() && self.points.are_shown() {
             if self.followed.is_none() {
                 self.observed.begin(&mut self.system, &self.step, self.fresh, None);
@@ -608,6 +631,29 @@ impl Adaptive {
             self.followed = Some(from);
         }
         self.points.until(&mut self.system, &self.step, theta, time)
+    }
+
+    /// Shows the steps that the model's own function has accepted, from the present point on.
+    fn show_settled(&mut self, settled: &Settled) -> Result<(), Stop> {
+        self.step.t = self.t;
+        copy(&self.x, &mut self.step.x0);
+        let (mut accepted, before) = (0, self.work.steps);
+        for call in 0..settled.calls {
+            if settled.accepted(call) == before + accepted {
+                continue;
+            }
+            accepted += 1;
+            let reached = settled.step(call, &mut self.step);
+            self.points.begin();
+            if let Err(stop) = self.points.until(&mut self.system, &self.step, 1.0, reached) {
+                self.count(accepted, call as u64 + 1 - accepted, false);
+                self.t = self.step.t;
+                return Err(stop);
+            }
+            self.step.t = reached;
+            std::mem::swap(&mut self.step.x0, &mut self.step.x1);
+        }
+        Ok(())
     }
 
     /// Enlarges the scale of a state to its largest magnitude.
@@ -637,7 +683,7 @@ impl Adaptive {
             self.suspect = f64::INFINITY;
         }
         self.h = self.h.min(0.5 * (self.suspect - reached));
-        self.show(1.0, reached)?;
+        self.show_until(1.0, reached)?;
         self.keep(1.0, reached)?;
         self.t = reached;
         copy(&self.step.x1, &mut self.x);
@@ -658,7 +704,7 @@ impl Adaptive {
     /// where derivatives jump.
     fn acts(&mut self, crossing: Crossing, jumps: bool) -> Result<bool, Stop> {
         let time = self.step.time(crossing.far);
-        self.show(crossing.near, time)?;
+        self.show_until(crossing.near, time)?;
         self.keep(crossing.near, time)?;
         self.step.at(crossing.far, &mut self.x);
         self.system.place(time, &self.x);
@@ -951,6 +997,20 @@ impl Stepper for Adaptive {
         Ok(None)
     }
 
+    fn series(&self) -> Option<(&[Slot], u64)> {
+        let series = self.series.as_ref().filter(|_| !self.attends && self.stiff)?;
+        Some((&series.slots, self.until_watched()))
+    }
+
+    /// Shows the steps that the function has accepted.
+    fn show(&mut self, calls: u64, column: &dyn Fn(usize, &mut [f64])) -> Result<(), Stop> {
+        let mut series = self.series.take().expect("its slots were asked for");
+        series.read(calls as usize, column);
+        let shown = self.show_settled(&series);
+        self.series = Some(series);
+        shown
+    }
+
     /// Accepts the steps that the function has completed, and evaluates the one that it left open, if any.
     fn take(&mut self, _: u64, status: u64) -> Result<(), Stop> {
         self.moved = false;
@@ -974,12 +1034,7 @@ impl Stepper for Adaptive {
         if overruns > 0 {
             self.meet(overruns as usize);
         }
-        self.work.steps += accepted;
-        self.work.stiff_steps += accepted;
-        self.work.rejected += refused;
-        let trials = accepted + refused + u64::from(status != 0);
-        self.work.jacobians += trials;
-        self.system.evaluations += 8 * trials;
+        self.count(accepted, refused, status != 0);
         if status == 0 {
             return Ok(());
         }

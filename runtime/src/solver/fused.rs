@@ -47,6 +47,49 @@ pub(crate) struct Judged {
     pub(crate) outside: bool,
 }
 
+/// The trials of some calls, as far as observers need them: column by column, after each call.
+pub(crate) struct Settled {
+    /// The slots of the columns.
+    pub(crate) slots: Vec<Slot>,
+    /// Number of calls.
+    pub(crate) calls: usize,
+    columns: Vec<f64>,
+}
+
+impl Settled {
+    pub(crate) fn new(trial: Trial) -> Settled {
+        let [k1, k2, k3] = trial.course();
+        let course = [trial.to().states, k1, k2, k3].into_iter().flat_map(|segment| segment.range());
+        let single = [trial.accepted(), trial.time(), trial.step(), trial.end()];
+        let slots = single.into_iter().chain(course.map(|slot| Slot(slot as u32))).collect();
+        Settled { slots, calls: 0, columns: Vec::new() }
+    }
+
+    /// Replaces the trials by those of so many calls. `column` writes the values of the slot with a given number.
+    pub(crate) fn read(&mut self, calls: usize, column: &dyn Fn(usize, &mut [f64])) {
+        self.calls = calls;
+        self.columns.resize(calls * self.slots.len(), 0.0);
+        self.columns.chunks_exact_mut(calls).enumerate().for_each(|(slot, values)| column(slot, values));
+    }
+
+    /// Number of steps that had been accepted after a call.
+    pub(crate) fn accepted(&self, call: usize) -> u64 {
+        self.columns[call] as u64
+    }
+
+    /// Writes the step that a call has accepted, apart from its start, and returns the time of its end in s.
+    pub(crate) fn step(&self, call: usize, step: &mut Step) -> f64 {
+        let mut values = self.columns[call..].iter().step_by(self.calls).skip(1);
+        let mut next = || *values.next().expect("a column for each slot");
+        let reached = next();
+        (step.h, step.end) = (next(), next());
+        for part in [&mut step.x1, &mut step.k1, &mut step.k2, &mut step.k3] {
+            part.iter_mut().for_each(|value| *value = next());
+        }
+        reached
+    }
+}
+
 impl Fused {
     /// None for a model without that function. `fine`: for each guard the least and the greatest value.
     pub(crate) fn new(instance: &mut Instance, tol: f64, fine: &[(f64, f64)]) -> Option<Fused> {
