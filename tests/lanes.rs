@@ -41,6 +41,18 @@ model Sampled {
 
 experiment last    { run Pull() for 10 s  expect final(x) > 0 m }
 experiment measured { run Pull() for 10 s  expect max(v) > 0 m/s  expect mean(power) > 0 W after 2 s }
+experiment many {
+  run Pull() for 10 s
+  expect max(v) > 0 m/s after 2 s
+  expect min(fr.F) < 1 N
+  expect time(max(v)) > 0 s
+  expect rms(v) > 0 m/s
+  expect rms(fr.F) > 0 N before 7 s
+  expect integral(power) > 0 J
+  expect period(v) > 0 s
+  expect max(x) > 0 m before first(v > 0.1 m/s)
+}
+experiment counted { run Pull() for 10 s  expect count(v > 0.1 m/s) >= 0  expect max(x) > 0 m }
 experiment regimes { run Pull(fr = Karnopp()) for 10 s  expect max(x) > 0 m }
 experiment narrow  { run Pull(fr = Karnopp(Dv = 1 um/s, Fv = 0 N·s/m)) for 20 s  expect final(x) > 0 m }
 experiment held    { run Pull(fr = KFM()) for 10 s  expect final(x) > 0 m }
@@ -160,9 +172,15 @@ fn compiled(experiment: &str, changes: Changes) -> Case {
 #[test]
 #[cfg_attr(not(target_arch = "x86_64"), ignore = "lanes are for x86-64")]
 fn adaptive_runs_share_their_lanes() {
-    for (experiment, path) in
-        [("last", "fr.Fs"), ("measured", "fr.Fs"), ("regimes", "fr.Fs"), ("narrow", "fr.Fs"), ("sampled", "Kp")]
-    {
+    for (experiment, path) in [
+        ("last", "fr.Fs"),
+        ("measured", "fr.Fs"),
+        ("many", "fr.Fs"),
+        ("counted", "fr.Fs"),
+        ("regimes", "fr.Fs"),
+        ("narrow", "fr.Fs"),
+        ("sampled", "Kp"),
+    ] {
         let varying = varying(experiment, path, None);
         let failed = compare(&varying, path, 30, if path == "Kp" { 15.0 } else { 1.1 }, 0.02);
         assert_eq!(failed, 0, "{experiment}");

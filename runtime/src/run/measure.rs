@@ -44,6 +44,8 @@ pub(crate) enum Wants {
     Square,
     /// Its turning points.
     Turns,
+    /// Those that exceed all points before.
+    Extremes,
     /// Points dense enough for linear or cubic interpolation.
     Points,
     /// Only the points at the edges of the window.
@@ -78,6 +80,11 @@ impl Expectations {
             .iter()
             .flatten()
             .flat_map(|meter| [Some(meter.slot), meter.begins, meter.ends, meter.moment].into_iter().flatten())
+    }
+
+    /// Whether an event opens or closes a window.
+    pub(crate) fn are_opened_by_events(&self) -> bool {
+        self.meters.iter().flatten().any(|meter| meter.begins.or(meter.ends).is_some())
     }
 
     /// What each measure needs, in the order of [`Expectations::give_area`].
@@ -449,6 +456,8 @@ impl Meter {
 
     fn demand(&self) -> Demand {
         let what = match &self.tally {
+            // A window that begins with the run has seen all points before.
+            Tally::Extremes { .. } | Tally::TimeOf { .. } if self.after <= 0.0 => Wants::Extremes,
             Tally::Extremes { .. } | Tally::TimeOf { .. } | Tally::Peaks { .. } => Wants::Turns,
             Tally::AtPeak { .. } => {
                 return Demand { slot: self.moment.unwrap_or(self.slot), what: Wants::Turns };

@@ -42,6 +42,7 @@ impl System {
     }
 
     /// Writes time in s and states in SI into the block.
+    #[inline]
     pub(crate) fn place(&mut self, t: f64, x: &[f64]) {
         let states = self.states.clone();
         let block = self.instance.block_mut();
@@ -203,18 +204,50 @@ impl Step {
         all.iter().all(|one| *one >= 0.0) || all.iter().all(|one| *one <= 0.0)
     }
 
+    /// Whether a state surely stays within bounds between two θ: the Bernstein coefficients of its polynomial, between whose
+    /// least and greatest it lies, are inside by more than their rounding.
+    pub(crate) fn is_within(&self, state: usize, (from, to): (f64, f64), (least, greatest): (f64, f64)) -> bool {
+        let [x0, x1, k1, k2, k3] = [&self.x0, &self.x1, &self.k1, &self.k2, &self.k3].map(|k| k[state]);
+        let terms = [x0, (x1 - x0 + k1) / 4.0, (k2 - k1) / 6.0, (k3 - k2) / 4.0, -k3];
+        let slack = 1e-12 * (greatest - least);
+        // The polar form of the polynomial at `to` so many times and at `from` otherwise.
+        let coefficient = |count: usize| {
+            // Elementary symmetric polynomials of these four.
+            let mut products = [1.0, 0.0, 0.0, 0.0, 0.0];
+            for place in 0..4 {
+                let theta = if place < count { to } else { from };
+                (1..5).rev().for_each(|k| products[k] += theta * products[k - 1]);
+            }
+            terms.iter().zip(products).map(|(term, product)| term * product).sum::<f64>()
+        };
+        (0..5).map(coefficient).all(|one| one >= least + slack && one <= greatest - slack)
+    }
+
     /// States at θ.
     pub(crate) fn at(&self, theta: f64, x: &mut [f64]) {
         if theta == 1.0 {
             x.copy_from_slice(&self.x1);
             return;
         }
-        let rest = 1.0 - theta;
-        for (i, x) in x.iter_mut().enumerate() {
-            let bend = self.k1[i] + theta * (self.k2[i] + theta * self.k3[i]);
-            *x = self.x0[i] + theta * (self.x1[i] - self.x0[i] + rest * bend);
+        let n = x.len();
+        // Slices of one length, so that the loop has no checks.
+        let [x0, x1, k1, k2, k3] = [&self.x0, &self.x1, &self.k1, &self.k2, &self.k3].map(|part| &part[..n]);
+        for i in 0..n {
+            x[i] = between([x0[i], x1[i], k1[i], k2[i], k3[i]], theta);
         }
     }
+
+    /// One state at θ.
+    pub(crate) fn state_at(&self, state: usize, theta: f64) -> f64 {
+        let [x0, x1, k1, k2, k3] = [&self.x0, &self.x1, &self.k1, &self.k2, &self.k3].map(|part| part[state]);
+        if theta == 1.0 { x1 } else { between([x0, x1, k1, k2, k3], theta) }
+    }
+}
+
+#[inline]
+fn between([x0, x1, k1, k2, k3]: [f64; 5], theta: f64) -> f64 {
+    let bend = k1 + theta * (k2 + theta * k3);
+    x0 + theta * (x1 - x0 + (1.0 - theta) * bend)
 }
 
 #[cfg(test)]
@@ -245,6 +278,39 @@ mod tests {
             (true, true) => Err(format!("it turns: {by:?}")),
             other => Ok(other),
         }
+    }
+
+    /// A mutant that looks at the values at the ends alone takes parts that leave their bounds in between for inside.
+    #[test]
+    fn a_part_that_leaves_its_bounds_is_never_found_within() {
+        let (mut inside, mut found) = (0, 0);
+        let never_leaves = |[bound, k1, k2, k3, a, b]: &[f64; 6]| {
+            let [x1, k1, k2, k3] = [*a, *k1, *k2, *k3].map(|one| vec![one]);
+            let step = Step { x1, k1, k2, k3, ..Step::new(1) };
+            let (part, bounds) = ((0.5 - 0.5 * b.abs(), 0.5 + 0.5 * b.abs()), (-0.1 - bound.abs(), 0.1 + bound.abs()));
+            let at = |k: usize| {
+                let mut x = [0.0];
+                step.at(part.0 + (part.1 - part.0) * k as f64 / 200.0, &mut x);
+                x[0]
+            };
+            let leaves = (0..=200).map(at).find(|x| !(bounds.0..=bounds.1).contains(x));
+            match (leaves, step.is_within(0, part, bounds)) {
+                (Some(x), true) => Err(format!("{x} is not within {bounds:?}")),
+                (leaves, is_found) => Ok((leaves.is_none(), is_found)),
+            }
+        };
+        let failed = hold(
+            seeds(4000),
+            case,
+            never_leaves,
+            |case, why| (*case, why),
+            |(is_inside, is_found)| {
+                inside += u64::from(is_inside);
+                found += u64::from(is_found);
+            },
+        );
+        assert!(failed.is_empty(), "{failed:?}");
+        assert!(3 * found > 2 * inside, "{found} of {inside} that stay within are found");
     }
 
     /// A mutant that looks at the slopes at the ends alone takes parts that turn twice for monotonic.
