@@ -29,9 +29,11 @@ const ROUNDS: usize = 15;
 /// Number of runs of the sweep.
 const RUNS: usize = 512;
 /// What a sweep measures besides the last position.
-const MEASURED: [(&str, &str); 3] = [
+const MEASURED: [(&str, &str); 5] = [
     ("the last position", ""),
     ("and max(v)", "  expect max(v) > -1 m/s"),
+    ("and rms(v)", "  expect rms(v) > 0 m/s"),
+    ("and max(fr.F)", "  expect max(fr.F) > -1 N"),
     ("and max(v), rms(fr.F)", "  expect max(v) > -1 m/s  expect rms(fr.F) > 0 N"),
 ];
 
