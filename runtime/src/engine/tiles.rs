@@ -14,6 +14,10 @@ use abi::{Instance, Slot};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
+/// Lanes are worth their steps from this part of them on. AVX-512: a fixed step in all 24 takes the time of four runs alone,
+/// an adaptive one in all 16 that of three, besides what each run takes.
+const LEAST_PART: usize = 4;
+
 /// Why a run has no values at some instants.
 #[derive(Debug)]
 pub enum Missing {
@@ -63,7 +67,7 @@ impl Tiles {
         let width = lanes.map_or(1, Lanes::width);
         while left.len() > 0 {
             let some: Vec<(Instance, Experiment)> = left.by_ref().take(width).collect();
-            match lanes.filter(|_| some.len() >= width.div_ceil(2)) {
+            match lanes.filter(|_| some.len() >= width.div_ceil(LEAST_PART).max(2)) {
                 Some(lanes) => {
                     let ended = some.iter().map(|_| None).collect();
                     let read = (instants.clone(), slots.to_vec());
