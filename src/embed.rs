@@ -30,8 +30,8 @@ use std::path::Path;
 use std::sync::Arc;
 use std::time::Instant;
 
-pub use crate::commands::fit::conclusion::Wishes as FitWishes;
-pub use fits::{Compared, Fit, FoundFit, Unknown, laws, ranked, table};
+pub use crate::commands::fit::conclusion::Choices as FitChoices;
+pub use fits::{Compared, Fit, FoundFit, Unknown, check as check_fits, laws, ranked, table};
 
 /// What is wrong with a text or with what was asked of it.
 #[derive(Clone, Debug)]

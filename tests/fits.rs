@@ -916,6 +916,19 @@ fn alternatives_of_a_slot_are_ranked() {
         let run = fric(&folder, &["run", "out/f.fric", "--no-error"]);
         assert!(run.status.success(), "seed {seed}: {run:?}");
     }
+    // A profile of what only some laws vary is no mistake.
+    fs::write(folder_of("slot").join("h.csv"), "t [s],v [m/s],F [N]\n".to_string() + &rubbed(0, 0.0)).unwrap();
+    for (file, options) in [("f.fric", &["--json", "--starts", "1"][..]), ("h.csv", &["--starts", "1"])] {
+        for (path, exit) in
+            [("fr.Fq", 2), ("Fv", if file == "h.csv" { 0 } else { 2 }), ("fr.Fv", if file == "h.csv" { 2 } else { 0 })]
+        {
+            let output = fric(&folder_of("slot"), &[&["fit", file, "--profile", path], options].concat());
+            assert_eq!(output.status.code(), Some(exit), "{file} {path}: {output:?}");
+            let told = String::from_utf8_lossy(&output.stderr).contains(&format!("`{path}`"));
+            assert_eq!(told, exit == 2, "{output:?}");
+            assert!(!folder_of("slot").join("out/f.stages").exists());
+        }
+    }
     let wrong = text.replace("fr.Fv", "fr.Fq");
     let (told, code) = said("slot-wrong", &wrong, &rubbed(0, 0.0), &[]);
     assert!(code == 1 && told.contains("E0204") && told.contains("`fr.Fq`"), "{told}");

@@ -4,7 +4,7 @@ use crate::text::{self, Text};
 use crate::watched::{guarded, watched};
 use crate::{arrays, raise};
 use compiler::{Changes, Options};
-use fric::embed::{self, Compared, FitWishes, FoundFit, Problems, Unknown};
+use fric::embed::{self, Compared, FitChoices, FoundFit, Problems, Unknown};
 use pyo3::exceptions::{PyOSError, PyValueError};
 use pyo3::prelude::*;
 use std::path::PathBuf;
@@ -48,12 +48,12 @@ impl Asked {
 }
 
 impl Wished {
-    fn wishes(self) -> FitWishes {
+    fn choices(self) -> FitChoices {
         let Wished { starts, seed, level, robust, profile, pieces } = self;
-        let mut wishes = FitWishes { profile, pieces, ..FitWishes::default() };
-        (wishes.settings.starts, wishes.settings.seed) = (starts, seed);
-        (wishes.settings.level, wishes.settings.robust) = (level, robust);
-        wishes
+        let mut choices = FitChoices { profile, pieces, ..FitChoices::default() };
+        (choices.settings.starts, choices.settings.seed) = (starts, seed);
+        (choices.settings.level, choices.settings.robust) = (level, robust);
+        choices
     }
 }
 
@@ -68,15 +68,15 @@ pub fn fit(
     wished: Wished,
 ) -> PyResult<(Vec<Found>, Vec<String>)> {
     let text = text.inner();
-    let (options, wishes) = (asked.options(py)?, wished.wishes());
+    let (options, choices) = (asked.options(py)?, wished.choices());
     let work = |progress: &crate::watched::Progress| {
         let one = |name: &String| text.fit(name, &options, asked.tables.clone(), asked.threads, progress.stop());
         let all: Vec<Vec<embed::Fit>> = names.iter().map(one).collect::<Result<_, _>>().map_err(Fault::Problems)?;
         let mut all: Vec<embed::Fit> = all.into_iter().flatten().collect();
-        all.iter().try_for_each(|fit| fit.check(&wishes)).map_err(Fault::Misused)?;
+        embed::check_fits(&all, &choices).map_err(Fault::Misused)?;
         match (all.len(), all.pop()) {
-            (1, Some(one)) => Ok((vec![one.search(&wishes).map_err(Fault::Problems)?], Vec::new())),
-            (_, last) => Ok(embed::ranked(all.into_iter().chain(last).collect(), &wishes)),
+            (1, Some(one)) => Ok((vec![one.search(&choices).map_err(Fault::Problems)?], Vec::new())),
+            (_, last) => Ok(embed::ranked(all.into_iter().chain(last).collect(), &choices)),
         }
     };
     let (answers, problems) = watched(py, None, work)?.map_err(|fault| match fault {

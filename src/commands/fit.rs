@@ -18,8 +18,8 @@ mod of_laws;
 
 use super::{End, load, reported, sound};
 use crate::args;
-use crate::commands::fit::conclusion::{Asked, Conclusion, Wishes, judged, own, told};
-use crate::commands::fit::kept::{Keeping, Kept};
+use crate::commands::fit::conclusion::{Asked, Choices, Conclusion, judged, own, told};
+use crate::commands::fit::kept::Keeping;
 use crate::commands::fit::search::{Found, Runs, Settings, search};
 use crate::compile::{self, Changes, Loaded, Options, Stopwatch};
 use crate::recording_files::Format;
@@ -133,6 +133,10 @@ fn one(
         terminal.error(&why);
         return End::Misused;
     }
+    if let Some(unknown) = Choices::of(args).unknown_profile(compiled.iter().flat_map(|fit| &fit.unknowns)) {
+        terminal.error(&format!("--profile: fit `{name}` does not vary `{unknown}`"));
+        return End::Misused;
+    }
     let kept = match keeping.begin(loaded, name, &compiled, terminal) {
         Ok(kept) => kept,
         Err(why) => {
@@ -140,19 +144,15 @@ fn one(
             return End::Failed;
         }
     };
-    if compiled.len() > 1 {
-        return alternatives(args, compiled, (loaded, name), (options, kept), terminal);
-    }
     let begin = Instant::now();
-    let compiled = compiled.into_iter().next().expect("it has been compiled");
-    let mut runs = Runs::new(compiled, args.threads);
-    runs.keep(kept);
+    let mut all: Vec<Runs> = compiled.into_iter().map(|fit| Runs::new(fit, args.threads)).collect();
+    all.iter_mut().for_each(|runs| runs.keep(kept.clone()));
+    if all.len() > 1 {
+        return alternatives(args, all, (loaded, name), &options.changes.data, terminal);
+    }
+    let runs = all.remove(0);
     if args.check {
         return check(args, &runs, loaded, name, terminal);
-    }
-    if let Some(unknown) = Wishes::of(args).unknown_profile(&runs) {
-        terminal.error(&format!("--profile: fit `{name}` does not vary `{unknown}`"));
-        return End::Misused;
     }
     let found = match search(&runs, Settings::of(args)) {
         Ok(found) => found,
@@ -170,31 +170,26 @@ fn one(
 /// Fits each alternative of a fit, ranks them, and shows the best.
 fn alternatives(
     args: &args::Fit,
-    all: Vec<compile::Fit>,
+    all: Vec<Runs>,
     (loaded, name): (&Loaded, &str),
-    (options, kept): (&Options, Option<Kept>),
+    data: &[String],
     terminal: &mut Terminal,
 ) -> End {
-    let mut tried = Vec::new();
-    for fit in all {
-        let mut runs = Runs::new(fit, args.threads);
-        runs.keep(kept.clone());
-        if args.check {
+    if args.check {
+        for runs in &all {
             if !args.quiet {
                 terminal.line(&terminal.styled(Style::Bold, &runs.label));
             }
-            if check(args, &runs, loaded, name, terminal) != End::Fine {
+            if check(args, runs, loaded, name, terminal) != End::Fine {
                 return End::Failed;
             }
-            continue;
         }
-        tried.push(rank::Tried::new(name, runs, Settings::of(args)));
-    }
-    if args.check {
         return End::Fine;
     }
+    let tried: Vec<rank::Tried> =
+        all.into_iter().map(|runs| rank::Tried::new(name, runs, Settings::of(args))).collect();
     let heading = rank::Heading { title: name, wrote: None };
-    rank::rank(args, &heading, (&args.file, &options.changes.data), loaded, &tried, terminal)
+    rank::rank(args, &heading, (&args.file, data), loaded, &tried, terminal)
 }
 
 /// Shows the answer of a fit and writes its files.
@@ -207,7 +202,7 @@ fn conclude(
     terminal: &mut Terminal,
 ) -> End {
     let name = question.name;
-    let concluded = match Conclusion::new(name, runs, found, &Wishes::of(args), rank, seconds) {
+    let concluded = match Conclusion::new(name, runs, found, &Choices::of(args), rank, seconds) {
         Ok(concluded) => concluded,
         Err(why) => {
             terminal.error(&why);

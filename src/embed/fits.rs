@@ -4,7 +4,7 @@
 //! intervals, and the files of `fric fit`.
 
 use super::{Problems, Text, without_effect};
-use crate::commands::fit::conclusion::{Asked, Conclusion, Wishes, recordings, told};
+use crate::commands::fit::conclusion::{Asked, Choices, Conclusion, recordings, told};
 use crate::commands::fit::rank::{self, Tried};
 use crate::commands::fit::search::{Found, Part, Runs, search};
 use crate::commands::fit::{answer, laws as standard};
@@ -129,7 +129,7 @@ impl Fit {
     /// What is compared, in the order of all residuals.
     pub fn compared(&self) -> Vec<Compared> {
         let of = |part: &Part| {
-            let before = if self.runs.parts.len() > 1 { format!("{}: ", part.asks.label) } else { String::new() };
+            let before = self.runs.before(part);
             let one = |item: &compile::FitItem| {
                 let rows = item.kept(&part.instants).into_iter();
                 let times =
@@ -165,21 +165,12 @@ impl Fit {
     ///
     /// # Errors
     /// That there is no answer, and why.
-    pub fn search(self, wishes: &Wishes) -> Result<FoundFit, Problems> {
+    pub fn search(self, choices: &Choices) -> Result<FoundFit, Problems> {
         let begin = Instant::now();
-        match search(&self.runs, wishes.settings) {
-            Ok(found) => FoundFit::new(self, found, wishes, None, begin.elapsed().as_secs_f64()),
+        match search(&self.runs, choices.settings) {
+            Ok(found) => FoundFit::new(self, found, choices, None, begin.elapsed().as_secs_f64()),
             Err(trouble) => Err(self.problem(&trouble)),
         }
-    }
-
-    /// A path of `profile` that it does not vary.
-    ///
-    /// # Errors
-    /// That path, in words.
-    pub fn check(&self, wishes: &Wishes) -> Result<(), String> {
-        let unknown = wishes.unknown_profile(&self.runs);
-        unknown.map_or(Ok(()), |unknown| Err(format!("profile: fit `{}` does not vary `{unknown}`", self.name)))
     }
 
     fn problem(&self, trouble: &Trouble) -> Problems {
@@ -192,12 +183,24 @@ impl Fit {
     }
 }
 
+/// A path of `profile` that none of these fits varies.
+///
+/// # Errors
+/// That path, in words.
+pub fn check(fits: &[Fit], choices: &Choices) -> Result<(), String> {
+    match (choices.unknown_profile(fits.iter().flat_map(|fit| &fit.runs.unknowns)), fits) {
+        (None, _) => Ok(()),
+        (Some(unknown), [one]) => Err(format!("profile: fit `{}` does not vary `{unknown}`", one.name)),
+        (Some(unknown), _) => Err(format!("profile: no fit varies `{unknown}`")),
+    }
+}
+
 /// Searches for the values of several laws, and ranks them by what they predict: the best first. Laws without an answer
 /// come as problems.
-pub fn ranked(fits: Vec<Fit>, wishes: &Wishes) -> (Vec<FoundFit>, Vec<Problems>) {
+pub fn ranked(fits: Vec<Fit>, choices: &Choices) -> (Vec<FoundFit>, Vec<Problems>) {
     let one = |fit: Fit| {
         let Fit { loaded, name, runs, tables, given } = fit;
-        (Tried::new(&name, runs, wishes.settings), (loaded, tables, given))
+        (Tried::new(&name, runs, choices.settings), (loaded, tables, given))
     };
     let (tried, mut others): (Vec<Tried>, Vec<_>) = fits.into_iter().map(one).map(|(a, b)| (a, Some(b))).unzip();
     let order = rank::order(&tried);
@@ -209,7 +212,7 @@ pub fn ranked(fits: Vec<Fit>, wishes: &Wishes) -> (Vec<FoundFit>, Vec<Problems>)
         let (loaded, tables, given) = other.expect("each law has one place");
         let fit = Fit { loaded, name, runs, tables, given };
         let ended = match found {
-            Ok(found) => FoundFit::new(fit, found, wishes, Some(&place), seconds),
+            Ok(found) => FoundFit::new(fit, found, choices, Some(&place), seconds),
             Err(trouble) => Err(fit.problem(&trouble)),
         };
         match ended {
@@ -233,11 +236,11 @@ impl FoundFit {
     fn new(
         fit: Fit,
         found: Found,
-        wishes: &Wishes,
+        choices: &Choices,
         rank: Option<&answer::Rank>,
         seconds: f64,
     ) -> Result<FoundFit, Problems> {
-        let concluded = Conclusion::new(&fit.name, &fit.runs, found, wishes, rank, seconds);
+        let concluded = Conclusion::new(&fit.name, &fit.runs, found, choices, rank, seconds);
         let wrong = |report: String| Problems { report, ..Problems::of(&fit.loaded, &[]) };
         let conclusion = concluded.map_err(wrong)?;
         let mut recordings = recordings(&fit.file(), &fit.runs, fit.given);

@@ -87,7 +87,7 @@ impl Fitted {
         for part in &runs.parts {
             notes.extend(part.varying.notes.iter().filter(|note| !notes.contains(note)).cloned().collect::<Vec<_>>());
             if part.asks.begins != 0.0 {
-                let of = if runs.parts.len() > 1 { format!("{}: ", part.asks.label) } else { String::new() };
+                let of = runs.before(part);
                 let begins = abi::format::time(part.asks.begins);
                 notes.push(format!("{of}time begins at the first row, at {begins} in the file"));
             }
@@ -683,7 +683,7 @@ fn rounded(si: f64, sd: f64, unit: &Unit) -> String {
 pub fn as_written(runs: &Runs, residuals: &[Vec<f64>]) -> String {
     let mut out = String::new();
     for (part, items) in runs.parts.iter().zip(runs.items()) {
-        let of = if runs.parts.len() > 1 { format!("{}: ", part.asks.label) } else { String::new() };
+        let of = runs.before(part);
         for (item, rows) in part.asks.items.iter().zip(&residuals[items]) {
             let rms = (rows.iter().map(|r| r * r).sum::<f64>() / rows.len().max(1) as f64).sqrt();
             let rows = count(rows.len() as u64);

@@ -38,7 +38,7 @@ pub struct Asked<'a> {
 
 /// What is asked beside the values.
 #[derive(Clone)]
-pub struct Wishes {
+pub struct Choices {
     /// How the values were searched for.
     pub settings: Settings,
     /// Parameters whose profile is computed; or all, or none. Else those that need it.
@@ -47,21 +47,21 @@ pub struct Wishes {
     pub pieces: usize,
 }
 
-impl Default for Wishes {
-    fn default() -> Wishes {
-        Wishes { settings: Settings::new(args::LEVEL), profile: Vec::new(), pieces: args::PIECES }
+impl Default for Choices {
+    fn default() -> Choices {
+        Choices { settings: Settings::new(args::LEVEL), profile: Vec::new(), pieces: args::PIECES }
     }
 }
 
-impl Wishes {
+impl Choices {
     /// As the command line states them.
-    pub fn of(args: &args::Fit) -> Wishes {
-        Wishes { settings: Settings::of(args), profile: args.profile.clone(), pieces: args.pieces }
+    pub fn of(args: &args::Fit) -> Choices {
+        Choices { settings: Settings::of(args), profile: args.profile.clone(), pieces: args.pieces }
     }
 
-    /// A parameter whose profile is wished and that the fit does not vary.
-    pub fn unknown_profile(&self, runs: &Runs) -> Option<&str> {
-        let is_known = |path: &str| runs.unknowns.iter().any(|unknown| unknown.path == path || unknown.label == path);
+    /// A parameter whose profile is asked for and that is none of these.
+    pub fn unknown_profile<'u>(&self, all: impl Iterator<Item = &'u compile::FitUnknown> + Clone) -> Option<&str> {
+        let is_known = |path: &str| all.clone().any(|unknown| unknown.path == path || unknown.label == path);
         self.profile.iter().map(String::as_str).find(|path| !matches!(*path, "all" | "none") && !is_known(path))
     }
 }
@@ -85,14 +85,14 @@ impl Conclusion {
         name: &str,
         runs: &Runs,
         found: Found,
-        wishes: &Wishes,
+        choices: &Choices,
         rank: Option<&Rank>,
         seconds: f64,
     ) -> Result<Conclusion, String> {
         let begin = Instant::now();
-        let settings = wishes.settings;
-        let (found, profiles) = profiled(wishes, runs, found);
-        let pieces = after::pieces(runs, &found, settings, wishes.pieces);
+        let settings = choices.settings;
+        let (found, profiles) = profiled(choices, runs, found);
+        let pieces = after::pieces(runs, &found, settings, choices.pieces);
         let validated = after::judge(runs, &found, settings);
         let (answer, steps, coarse) = found;
         let mut fitted =
@@ -109,7 +109,7 @@ impl Conclusion {
         let mut outcomes = Vec::new();
         for ((part, step), items) in runs.parts.iter().zip(&steps).zip(runs.items()) {
             let values = &fitted.answer.values;
-            let of = if runs.parts.len() > 1 { format!("{}: ", part.asks.label) } else { String::new() };
+            let of = runs.before(part);
             let (outcome, left) = judged(part, values, *step)
                 .map_err(|failure| format!("{name}: {of}the fitted run stops: {failure}"))?;
             fitted.notes.extend(left.map(|left| format!("{of}{left}")));
@@ -244,15 +244,15 @@ fn compared(
 
 /// The profiles that are asked for, or that the answer needs. Where a profile meets a better answer, the search goes on
 /// from there, once.
-fn profiled(wishes: &Wishes, runs: &Runs, mut found: Found) -> (Found, Vec<Option<after::Profile>>) {
-    let settings = wishes.settings;
+fn profiled(choices: &Choices, runs: &Runs, mut found: Found) -> (Found, Vec<Option<after::Profile>>) {
+    let settings = choices.settings;
     let n = runs.unknowns.len();
     let mut again = true;
     'answer: loop {
         let answer = &found.0;
         let is_asked = |k: usize| {
             let unknown = &runs.unknowns[k];
-            match &wishes.profile[..] {
+            match &choices.profile[..] {
                 [] => answer.at_bound[k].is_some() || after::is_open(answer, k),
                 [one] if one == "none" => false,
                 named => named.iter().any(|one| *one == "all" || *one == unknown.path || *one == unknown.label),

@@ -1,5 +1,6 @@
 //! `fric fit FILE.csv`: the standard laws, fitted to a recording and ranked by what they predict.
 
+use super::conclusion::Choices;
 use super::kept::Keeping;
 use super::rank::{self, Heading, Tried};
 use super::search::{Runs, Settings};
@@ -46,16 +47,24 @@ pub fn of_laws(args: &args::Fit, terminal: &mut Terminal) -> End {
             return End::Failed;
         }
     };
-    let mut tried: Vec<Tried> = Vec::new();
-    let mut keeping = Keeping::new(args);
+    let mut all = Vec::new();
     for name in names {
-        let compiled = match compile::fit(&mut loaded, &crate::disk::Disk, &name, &options, &mut Vec::new()) {
-            Ok(compiled) => compiled,
+        match compile::fit(&mut loaded, &crate::disk::Disk, &name, &options, &mut Vec::new()) {
+            Ok(compiled) => all.push((name, compiled)),
             Err(errors) => {
                 reported(&loaded, &errors, terminal);
                 return End::Failed;
             }
-        };
+        }
+    }
+    let unknowns = all.iter().flat_map(|(_, compiled)| compiled).flat_map(|fit| &fit.unknowns);
+    if let Some(unknown) = Choices::of(args).unknown_profile(unknowns) {
+        terminal.error(&format!("--profile: no law has a parameter `{unknown}`"));
+        return End::Misused;
+    }
+    let mut tried: Vec<Tried> = Vec::new();
+    let mut keeping = Keeping::new(args);
+    for (name, compiled) in all {
         let kept = match keeping.begin(&loaded, &name, &compiled, terminal) {
             Ok(kept) => kept,
             Err(why) => {

@@ -161,7 +161,7 @@ fn compared(fitted: &Fitted, runs: &Runs) -> String {
         String::from("<table>\n<tr><th>compared</th><th>rows</th><th>rms</th><th>noise</th><th>remarks</th></tr>\n");
     for ((part, run), items) in runs.parts.iter().zip(&fitted.runs).zip(runs.items()) {
         for ((item, k), remarks) in part.asks.items.iter().zip(items).zip(&run.remarks) {
-            let of = if runs.parts.len() > 1 { format!("{}: ", part.asks.label) } else { String::new() };
+            let of = runs.before(part);
             let order = fitted.answer.noise[k].order();
             let mut noise = if order == 0 { "white".to_string() } else { format!("autoregressive of order {order}") };
             if fitted.answer.misfits && order > 0 {

@@ -390,6 +390,11 @@ impl Runs {
         self.parts.iter().map(one).collect()
     }
 
+    /// What stands before the lines of a recording: its label and a colon, where there are several.
+    pub fn before(&self, part: &Part) -> String {
+        if self.parts.len() > 1 { format!("{}: ", part.asks.label) } else { String::new() }
+    }
+
     /// Number of compared rows.
     pub fn rows(&self) -> usize {
         self.parts.iter().map(|part| part.asks.rows.len()).sum()
