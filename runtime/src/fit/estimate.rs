@@ -1,13 +1,14 @@
 //! The procedure of a fit: from a start to values with intervals.
 //!
-//! In: a [`Question`]. Out: an [`Answer`], or a [`Trouble`]. Several starts are judged, and searches follow the best of
-//! them until two end alike. Where a model may have many local minima, they follow a path: runs that are held to the
-//! data, less and less (an observer whose gain falls to zero), or over a growing part of the rows. Output error, weighted
-//! by a noise model: first white noise, then twice an autoregressive model of the residuals, with which residuals and
-//! derivatives are whitened and the search continues. Where whitening moves the values further than noise could, the
-//! residuals are no noise, and the estimate remains that of least squares. Derivatives are central differences, of a size that the noise
-//! determines. A robust fit minimises Huber's loss of the whitened residuals once the minimum has been found; its bounds
-//! follow from the residuals before each search, and are constant while it lasts, so that the loss only falls.
+//! In: a [`Question`]. Out: an [`Answer`], or a [`Trouble`]. Several starts are judged, and searches follow the best
+//! of them until two end alike. Where a model may have many local minima, they follow a path: runs that are held to
+//! the data, less and less (an observer whose gain falls to zero), or over a growing part of the rows. Output error,
+//! weighted by a noise model: first white noise, then twice an autoregressive model of the residuals, with which
+//! residuals and derivatives are whitened and the search continues. Where whitening moves the values further than
+//! noise could, the residuals are no noise, and the estimate remains that of least squares. Derivatives are
+//! differences of a size that the noise determines: central ones, or one-sided ones in the stages of a path. A robust
+//! fit minimises Huber's loss of the whitened residuals once the minimum has been found; its bounds follow from the
+//! residuals before each search, and are constant while it lasts, so that the loss only falls.
 
 use crate::fit::journal::{Journal, Numbers, Stage, of_list, of_noise};
 use crate::fit::least_squares::{Triangle, singular};

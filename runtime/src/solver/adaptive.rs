@@ -351,7 +351,7 @@ impl Adaptive {
         if attend { 1 } else { self.until_watched() }
     }
 
-    /// Number of attempts to the next call of the progress callback.
+    /// Number of attempts until the progress callback is called again.
     fn until_watched(&self) -> u64 {
         WATCHED - self.attempts() % WATCHED
     }

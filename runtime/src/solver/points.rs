@@ -99,8 +99,8 @@ impl Column {
 const TOGETHER: usize = 64;
 
 /// Points that measures have not seen yet.
-#[derive(Default)]
 struct Unseen {
+    slots: Vec<Slot>,
     times: Vec<f64>,
     /// Row-major, SI.
     values: Vec<f64>,
@@ -109,8 +109,8 @@ struct Unseen {
 
 impl Unseen {
     /// Shows them.
-    fn show(&mut self, slots: &[Slot], observer: &mut Observer) {
-        let Unseen { times, values, stretch } = self;
+    fn show(&mut self, observer: &mut Observer) {
+        let Unseen { slots, times, values, stretch } = self;
         if times.is_empty() {
             return;
         }
@@ -128,7 +128,6 @@ pub(crate) struct Points {
     duration: f64,
     /// Slots that are observed.
     slots: Vec<usize>,
-    seen: Vec<Slot>,
     /// Whether all observed slots are states.
     only_states: bool,
     tol: f64,
@@ -151,7 +150,7 @@ pub(crate) struct Points {
     /// A block in which only time and the observed slots are valid.
     block: Vec<f64>,
     x: Vec<f64>,
-    /// Time in s at which the first row was computed.
+    /// Time in s at which the values of the first row hold. An integral that begins there takes them for its first node.
     row_time: f64,
     /// θ and time in s of the last node of an integral, whose values are known.
     node: Option<(f64, f64)>,
@@ -185,6 +184,7 @@ impl Points {
         });
         // Whether an integral is to be taken depends on the points so far.
         let waits = observer.expectations.are_opened_by_events();
+        let sees_together = observer.recorder.is_empty() && !waits && !slots.contains(&Slot::TIME.index());
         let recorded: Vec<usize> = observer.recorder.slots().map(|slot| slot.index()).collect();
         let columns = slots.iter().map(|slot| {
             let wants = |what| demands.iter().any(|demand| demand.what == what && demand.slot.index() == *slot);
@@ -216,9 +216,12 @@ impl Points {
             x: vec![0.0; instance.description().layout.states.len as usize],
             row_time: f64::NAN,
             node: None,
-            unseen: (observer.recorder.is_empty() && !waits && !slots.contains(&Slot::TIME.index()))
-                .then(Unseen::default),
-            seen: slots.iter().map(|slot| Slot(*slot as u32)).collect(),
+            unseen: sees_together.then(|| Unseen {
+                slots: slots.iter().map(|slot| Slot(*slot as u32)).collect(),
+                times: Vec::new(),
+                values: Vec::new(),
+                stretch: Stretch::default(),
+            }),
             slots,
             observer,
         }
@@ -244,7 +247,7 @@ impl Points {
     /// Returns the observer.
     pub(crate) fn observer(mut self) -> Observer {
         if let Some(unseen) = &mut self.unseen {
-            unseen.show(&self.seen, &mut self.observer);
+            unseen.show(&mut self.observer);
         }
         self.observer
     }
@@ -564,7 +567,7 @@ impl Points {
                 unseen.times.push(time);
                 unseen.values.extend_from_slice(values);
                 if unseen.times.len() == TOGETHER {
-                    unseen.show(&self.seen, &mut self.observer);
+                    unseen.show(&mut self.observer);
                 }
             }
             None => {

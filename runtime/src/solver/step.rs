@@ -262,19 +262,19 @@ mod tests {
         [(); 6].map(|()| chance.below(2001) as f64 / 1000.0 - 1.0)
     }
 
+    /// The state of a step of one state at 201 equally distant places of a part.
+    fn along(step: &Step, (from, to): (f64, f64)) -> Vec<f64> {
+        (0..=200).map(|k| step.state_at(0, from + (to - from) * f64::from(k) / 200.0)).collect()
+    }
+
     /// Whether a part that turns is not found monotonic; gives whether it turns, and whether it is found.
     fn holds(&[x1, k1, k2, k3, a, b]: &[f64; 6]) -> Result<(bool, bool), String> {
         let [x1, k1, k2, k3] = [x1, k1, k2, k3].map(|one| vec![one]);
         let step = Step { x1, k1, k2, k3, ..Step::new(1) };
-        let (from, to) = (0.5 + 0.5 * a.min(b), 0.5 + 0.5 * a.max(b));
-        let at = |k: usize| {
-            let mut x = [0.0];
-            step.at(from + (to - from) * k as f64 / 200.0, &mut x);
-            x[0]
-        };
-        let by: Vec<f64> = (0..200).map(|k| at(k + 1) - at(k)).collect();
+        let part = (0.5 + 0.5 * a.min(b), 0.5 + 0.5 * a.max(b));
+        let by: Vec<f64> = along(&step, part).windows(2).map(|pair| pair[1] - pair[0]).collect();
         let turns = by.iter().any(|by| *by < -1e-12) && by.iter().any(|by| *by > 1e-12);
-        match (turns, step.is_monotonic(0, (from, to))) {
+        match (turns, step.is_monotonic(0, part)) {
             (true, true) => Err(format!("it turns: {by:?}")),
             other => Ok(other),
         }
@@ -288,12 +288,7 @@ mod tests {
             let [x1, k1, k2, k3] = [*a, *k1, *k2, *k3].map(|one| vec![one]);
             let step = Step { x1, k1, k2, k3, ..Step::new(1) };
             let (part, bounds) = ((0.5 - 0.5 * b.abs(), 0.5 + 0.5 * b.abs()), (-0.1 - bound.abs(), 0.1 + bound.abs()));
-            let at = |k: usize| {
-                let mut x = [0.0];
-                step.at(part.0 + (part.1 - part.0) * k as f64 / 200.0, &mut x);
-                x[0]
-            };
-            let leaves = (0..=200).map(at).find(|x| !(bounds.0..=bounds.1).contains(x));
+            let leaves = along(&step, part).into_iter().find(|x| !(bounds.0..=bounds.1).contains(x));
             match (leaves, step.is_within(0, part, bounds)) {
                 (Some(x), true) => Err(format!("{x} is not within {bounds:?}")),
                 (leaves, is_found) => Ok((leaves.is_none(), is_found)),
