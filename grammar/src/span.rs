@@ -28,6 +28,11 @@ impl Span {
         Span { file: self.file, start: self.start.min(other.start), end: self.end.max(other.end) }
     }
 
+    /// Whether it lies within a place.
+    pub fn is_within(self, place: Span) -> bool {
+        self.file == place.file && place.start <= self.start && self.end <= place.end
+    }
+
     /// The span as a range of byte offsets.
     pub fn range(self) -> std::ops::Range<usize> {
         self.start as usize..self.end as usize

@@ -60,7 +60,7 @@ pub struct ChangeOf<'a>(Change<'a>);
 impl<'a> ChangeOf<'a> {
     /// The change as input of flattening; its value is read in the scope of this file.
     pub fn override_in(&self, file: FileId) -> Override<'a> {
-        Override { path: self.0.path, value: self.0.value, file }
+        self.0.in_file(file)
     }
 }
 

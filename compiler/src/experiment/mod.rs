@@ -24,7 +24,7 @@ use derived::derive;
 use expectations::ExpectAt;
 use plots::{CurveAt, PlotAt};
 use recording::recording;
-use sweeps::{combinations, grids, label, meets, same_path, unmatched_cases};
+use sweeps::{combinations, grids, is_part_of, label, meets, same_path, unmatched_cases};
 
 use crate::analysis::linearise::{OpenPorts, PortSlots, Ports, open};
 use crate::analysis::parameter_checks;
@@ -185,6 +185,13 @@ struct Change<'a> {
     value: OverrideValue<'a>,
 }
 
+impl<'a> Change<'a> {
+    /// As input of flattening; its value is read in the scope of this file.
+    fn in_file(self, file: FileId) -> Override<'a> {
+        Override { path: self.path, value: self.value, file }
+    }
+}
+
 /// Reads and lowers an experiment.
 ///
 /// # Errors All errors; at least one.
@@ -305,6 +312,23 @@ pub fn read(
     // Arguments of a rig are changes of the system that it runs.
     let args = prepared.as_ref().map_or(&[][..], |_| &parts.run.instance.args);
     let arg_paths: Vec<ast::Path> = args.iter().map(ast::Bind::path).collect();
+    let written = || {
+        arg_paths.iter().zip(args).map(|(path, bind)| {
+            let value = match &bind.value {
+                ast::BindValue::Expr(expr) => OverrideValue::Expr(expr),
+                ast::BindValue::Instance(instance) => OverrideValue::Instance(instance),
+            };
+            Change { path, value }
+        })
+    };
+    let replaced = replaced_arguments(&parts, &given);
+    if !replaced.is_empty() {
+        let overrides = written().map(|change| change.in_file(root)).collect();
+        let errors = errors_as_written(texts, &parts, prepared.as_ref(), &data, overrides, &replaced);
+        if !errors.is_empty() {
+            return Err(errors);
+        }
+    }
     let mut variants = Vec::new();
     for combination in combinations {
         let label = label(loaded, &parts, &combination);
@@ -330,15 +354,7 @@ pub fn read(
             [*change].into_iter().chain(also.iter().map(move |path| Change { path, value }))
         });
         let changes = swept.chain(given.set.iter().map(CommandLine::change));
-        let written = arg_paths.iter().zip(args).map(|(path, bind)| {
-            let value = match &bind.value {
-                ast::BindValue::Expr(expr) => OverrideValue::Expr(expr),
-                ast::BindValue::Instance(instance) => OverrideValue::Instance(instance),
-            };
-            Change { path, value }
-        });
-        let changes = written.chain(changes);
-        let overrides = changes.map(|c| Override { path: c.path, value: c.value, file: root }).collect();
+        let overrides = written().chain(changes).map(|change| change.in_file(root)).collect();
         match variant(
             loaded,
             sources,
@@ -774,10 +790,49 @@ fn rig_of(
     Ok(Some(rig::prepare(loaded, sources, item)))
 }
 
+/// Places of the arguments of a run of which a sweep, or a change from outside, replaces the whole or a part.
+fn replaced_arguments(parts: &Statements, given: &CommandLine) -> Vec<Span> {
+    let swept = parts.sweeps.iter().flat_map(|sweep| std::iter::once(&sweep.path).chain(&sweep.also));
+    let changed: Vec<&ast::Path> = swept.chain(given.set.iter().map(|set| &set.path)).collect();
+    let is_changed = |bind: &&ast::Bind| changed.iter().any(|path| is_part_of(path, &bind.path()));
+    parts.run.instance.args.iter().filter(is_changed).map(|bind| bind.span).collect()
+}
+
+/// The errors in replaced arguments: no run uses such a value, but it must be right where it is written. `overrides`:
+/// arguments of a rig.
+fn errors_as_written<'a>(
+    (loaded, sources, root): (&'a Loaded, &'a dyn Sources, FileId),
+    parts: &Statements<'a>,
+    prepared: Option<&'a LoadedRig>,
+    data: &[(String, Table, Unit)],
+    overrides: Vec<Override<'a>>,
+    replaced: &[Span],
+) -> Vec<Diagnostic> {
+    let mut found = Vec::new();
+    let (observed, data) = (Vec::new(), data.to_vec());
+    match prepared {
+        Some(prepared) => drop(rig::read(loaded, sources, prepared, overrides, observed, data, &mut found)),
+        None => {
+            let instance = Instance::Written(&parts.run.instance, root);
+            let unknowns = of_fit::declared(&parts.unknowns, &mut found);
+            let flat =
+                flatten(loaded, sources, &Request { instance, overrides, observed, data, frame: None, unknowns });
+            found.extend(flat.diagnostics);
+            analyse(&flat.system, &loaded.files, Depth::Units, &Diagnostic::is_error, &mut found);
+        }
+    }
+    // What is missing without the change may come from it.
+    let is_theirs = |error: &Diagnostic| {
+        error.code != "E0203"
+            && error.labels.iter().any(|label| replaced.iter().any(|span| label.span.is_within(*span)))
+    };
+    found.retain(|error| error.is_error() && is_theirs(error));
+    found
+}
+
 /// Whether a diagnostic lies outside a span.
 fn outside_of(place: Span, diagnostic: &Diagnostic) -> bool {
-    let span = diagnostic.span();
-    span.file != place.file || span.start < place.start || span.end > place.end
+    !diagnostic.span().is_within(place)
 }
 
 /// The text of a switching surface, from its encoded span.

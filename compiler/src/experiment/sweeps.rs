@@ -142,8 +142,13 @@ pub(super) fn combinations<'a>(
 }
 
 pub(super) fn same_path(a: &ast::Path, b: &ast::Path) -> bool {
-    let part = |segment: &ast::Segment| (segment.name.text.clone(), segment.index);
-    a.segments.iter().map(part).eq(b.segments.iter().map(part))
+    a.segments.len() == b.segments.len() && is_part_of(a, b)
+}
+
+/// Whether a path leads to the end of another one or goes on from there: `fr.Fs` is part of `fr`.
+pub(super) fn is_part_of(path: &ast::Path, of: &ast::Path) -> bool {
+    let is_same = |(a, b): (&ast::Segment, &ast::Segment)| a.name.text == b.name.text && a.index == b.index;
+    path.segments.len() >= of.segments.len() && path.segments.iter().zip(&of.segments).all(is_same)
 }
 
 /// Whether a value of a sweep is the one that a case names: the same number, or else the same text.

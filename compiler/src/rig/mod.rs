@@ -198,7 +198,7 @@ pub fn read<'a>(
 ) -> Option<PartitionedRig> {
     diagnostics.extend(prepared.diagnostics.iter().cloned());
     let rig = prepared.rig();
-    let misread = loaded.diagnostics.iter().any(|d| d.is_error() && within(rig.span, d.span()));
+    let misread = loaded.diagnostics.iter().any(|d| d.is_error() && d.span().is_within(rig.span));
     let statements = Statements::of(rig, misread, diagnostics)?;
     let mut reader = RigReader {
         loaded,
@@ -239,7 +239,7 @@ pub fn read<'a>(
     if let Some(hardware) = statements.hardware
         && flat.diagnostics.iter().any(|d| d.span() == hardware.part.span)
     {
-        flat.diagnostics.retain(|d| d.span() == hardware.part.span || !within(hardware.span, d.span()));
+        flat.diagnostics.retain(|d| d.span() == hardware.part.span || !d.span().is_within(hardware.span));
     }
     reader.diagnostics.extend(flat.diagnostics);
     let framed = flat.framed?;
@@ -251,11 +251,6 @@ pub fn read<'a>(
         said.is_error() || !said.code.starts_with("W08") || !lint.is_some_and(|(name, _)| allowed(name))
     });
     cut
-}
-
-/// Whether a span lies within another.
-fn within(outer: Span, inner: Span) -> bool {
-    inner.file == outer.file && outer.start <= inner.start && inner.end <= outer.end
 }
 
 /// Indices of the rig's expressions among all expressions of the frame.
@@ -745,7 +740,7 @@ impl<'a> RigReader<'a, '_> {
     /// Whether a wire of the part has an error. Missing wires are then not reported.
     fn hardware_is_wrong(&self) -> bool {
         let Some(hardware) = self.statements.hardware else { return false };
-        self.diagnostics.iter().any(|said| said.is_error() && within(hardware.span, said.span()))
+        self.diagnostics.iter().any(|said| said.is_error() && said.span().is_within(hardware.span))
     }
 
     fn errors(&self) -> usize {
