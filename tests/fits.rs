@@ -922,8 +922,11 @@ fn alternatives_of_a_slot_are_ranked() {
         for (path, exit) in
             [("fr.Fq", 2), ("Fv", if file == "h.csv" { 0 } else { 2 }), ("fr.Fv", if file == "h.csv" { 2 } else { 0 })]
         {
+            let laws = folder_of("slot").join("out/h_laws.fric");
+            let _ = fs::remove_file(&laws);
             let output = fric(&folder_of("slot"), &[&["fit", file, "--profile", path], options].concat());
             assert_eq!(output.status.code(), Some(exit), "{file} {path}: {output:?}");
+            assert_eq!(laws.exists(), file == "h.csv" && exit == 0, "{path}: a refused fit leaves no file");
             let told = String::from_utf8_lossy(&output.stderr).contains(&format!("`{path}`"));
             assert_eq!(told, exit == 2, "{output:?}");
             assert!(!folder_of("slot").join("out/f.stages").exists());

@@ -32,12 +32,6 @@ pub fn of_laws(args: &args::Fit, terminal: &mut Terminal) -> End {
     let place = args.out.join(format!("{stem}_laws.fric"));
     let loaded = load_text(&place.display().to_string(), &text, &crate::disk::Disk, terminal, &mut watch);
     let Some(mut loaded) = loaded else { return End::Failed };
-    if !args.json
-        && let Err(error) = project::write(&place, text.as_bytes())
-    {
-        terminal.error(&format!("cannot write {}: {error}", place.display()));
-        return End::Failed;
-    }
     let changes = Changes { tol: args.tol, ..args.stepped.changes() };
     let options = Options { changes, interpret: args.interpret };
     let names = match chosen(&place, &args.fits, &loaded) {
@@ -61,6 +55,12 @@ pub fn of_laws(args: &args::Fit, terminal: &mut Terminal) -> End {
     if let Some(unknown) = Choices::of(args).unknown_profile(unknowns) {
         terminal.error(&format!("--profile: no law has a parameter `{unknown}`"));
         return End::Misused;
+    }
+    if !args.json
+        && let Err(error) = project::write(&place, text.as_bytes())
+    {
+        terminal.error(&format!("cannot write {}: {error}", place.display()));
+        return End::Failed;
     }
     let mut tried: Vec<Tried> = Vec::new();
     let mut keeping = Keeping::new(args);
