@@ -630,12 +630,10 @@ pub fn dissipation(
         return None;
     };
     let paths: Vec<ast::Path> = instance.args.iter().map(ast::Bind::path).collect();
-    let given = paths.iter().zip(&instance.args).map(|(path, bind)| {
-        let value = match &bind.value {
-            ast::BindValue::Expr(expr) => frontend::flatten::OverrideValue::Expr(expr),
-            ast::BindValue::Instance(instance) => frontend::flatten::OverrideValue::Instance(instance),
-        };
-        frontend::flatten::Override { path, value, file }
+    let given = paths.iter().zip(&instance.args).map(|(path, bind)| frontend::flatten::Override {
+        path,
+        value: (&bind.value).into(),
+        file,
     });
     let (system, types, diagnostics) = alone(loaded, sources, (model, item.file), given.collect(), Depth::Causality);
     if diagnostics.iter().any(Diagnostic::is_error) {

@@ -28,7 +28,7 @@ impl Span {
         Span { file: self.file, start: self.start.min(other.start), end: self.end.max(other.end) }
     }
 
-    /// Whether it lies within a place.
+    /// Whether all of it lies within another span, in the same file.
     pub fn is_within(self, place: Span) -> bool {
         self.file == place.file && place.start <= self.start && self.end <= place.end
     }

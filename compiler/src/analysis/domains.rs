@@ -30,10 +30,7 @@ pub fn check(system: &System, types: &Types, files: &Files, diagnostics: &mut Ve
 pub fn check_given(system: &System, types: &Types, files: &Files, run: Span, diagnostics: &mut Vec<Diagnostic>) {
     let mut reach = Reach::new(system);
     let mut visit = Visit { seen: vec![HashSet::default()], constants: true };
-    let written = |id: ExprId| {
-        let span = system.span(id);
-        span.file == run.file && run.start <= span.start && span.end <= run.end
-    };
+    let written = |id: ExprId| system.span(id).is_within(run);
     for var in &system.vars {
         match var.definition {
             Definition::Value(value, Origin::Argument { .. }) if written(value) => {

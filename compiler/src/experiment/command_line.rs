@@ -58,7 +58,7 @@ impl Overrides {
 pub struct ChangeOf<'a>(Change<'a>);
 
 impl<'a> ChangeOf<'a> {
-    /// The change as input of flattening; its value is read in the scope of this file.
+    /// The change as an override for flattening. Names in its value are resolved in the scope of this file.
     pub fn override_in(&self, file: FileId) -> Override<'a> {
         self.0.in_file(file)
     }

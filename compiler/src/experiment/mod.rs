@@ -186,7 +186,7 @@ struct Change<'a> {
 }
 
 impl<'a> Change<'a> {
-    /// As input of flattening; its value is read in the scope of this file.
+    /// The change as an override for flattening. Names in its value are resolved in the scope of this file.
     fn in_file(self, file: FileId) -> Override<'a> {
         Override { path: self.path, value: self.value, file }
     }
@@ -312,15 +312,7 @@ pub fn read(
     // Arguments of a rig are changes of the system that it runs.
     let args = prepared.as_ref().map_or(&[][..], |_| &parts.run.instance.args);
     let arg_paths: Vec<ast::Path> = args.iter().map(ast::Bind::path).collect();
-    let written = || {
-        arg_paths.iter().zip(args).map(|(path, bind)| {
-            let value = match &bind.value {
-                ast::BindValue::Expr(expr) => OverrideValue::Expr(expr),
-                ast::BindValue::Instance(instance) => OverrideValue::Instance(instance),
-            };
-            Change { path, value }
-        })
-    };
+    let written = || arg_paths.iter().zip(args).map(|(path, bind)| Change { path, value: (&bind.value).into() });
     let replaced = replaced_arguments(&parts, &given);
     if !replaced.is_empty() {
         let overrides = written().map(|change| change.in_file(root)).collect();
@@ -790,7 +782,7 @@ fn rig_of(
     Ok(Some(rig::prepare(loaded, sources, item)))
 }
 
-/// Places of the arguments of a run of which a sweep, or a change from outside, replaces the whole or a part.
+/// Spans of the arguments of a run that a sweep or a change from outside replaces, as a whole or in part.
 fn replaced_arguments(parts: &Statements, given: &CommandLine) -> Vec<Span> {
     let swept = parts.sweeps.iter().flat_map(|sweep| std::iter::once(&sweep.path).chain(&sweep.also));
     let changed: Vec<&ast::Path> = swept.chain(given.set.iter().map(|set| &set.path)).collect();
@@ -798,8 +790,8 @@ fn replaced_arguments(parts: &Statements, given: &CommandLine) -> Vec<Span> {
     parts.run.instance.args.iter().filter(is_changed).map(|bind| bind.span).collect()
 }
 
-/// The errors in replaced arguments: no run uses such a value, but it must be right where it is written. `overrides`:
-/// arguments of a rig.
+/// The errors in replaced arguments. No run uses such a value, but an engineer reads it as one of the experiment, so its
+/// names and units are checked. `overrides`: the arguments of a rig.
 fn errors_as_written<'a>(
     (loaded, sources, root): (&'a Loaded, &'a dyn Sources, FileId),
     parts: &Statements<'a>,
@@ -821,7 +813,7 @@ fn errors_as_written<'a>(
             analyse(&flat.system, &loaded.files, Depth::Units, &Diagnostic::is_error, &mut found);
         }
     }
-    // What is missing without the change may come from it.
+    // E0203 reports a missing argument, which the sweep may supply.
     let is_theirs = |error: &Diagnostic| {
         error.code != "E0203"
             && error.labels.iter().any(|label| replaced.iter().any(|span| label.span.is_within(*span)))

@@ -145,7 +145,7 @@ pub(super) fn same_path(a: &ast::Path, b: &ast::Path) -> bool {
     a.segments.len() == b.segments.len() && is_part_of(a, b)
 }
 
-/// Whether a path leads to the end of another one or goes on from there: `fr.Fs` is part of `fr`.
+/// Whether a path begins with all segments of another one: `fr` and `fr.Fs` are part of `fr`.
 pub(super) fn is_part_of(path: &ast::Path, of: &ast::Path) -> bool {
     let is_same = |(a, b): (&ast::Segment, &ast::Segment)| a.name.text == b.name.text && a.index == b.index;
     path.segments.len() >= of.segments.len() && path.segments.iter().zip(&of.segments).all(is_same)

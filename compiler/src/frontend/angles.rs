@@ -497,7 +497,7 @@ impl<'a> Reader<'a> {
             _ => None,
         });
         experiments.flatten().any(|statement| match statement {
-            ExperimentStatement::Expect(expect) => expect.span.start <= span.start && span.end <= expect.span.end,
+            ExperimentStatement::Expect(expect) => span.is_within(expect.span),
             _ => false,
         })
     }

@@ -137,9 +137,7 @@ impl Loaded {
 
     /// Whether an error lies within this span.
     pub fn misread(&self, place: Span) -> bool {
-        self.diagnostics.iter().any(|d| {
-            d.is_error() && place.file == d.span().file && place.start <= d.span().start && d.span().end <= place.end
-        })
+        self.diagnostics.iter().any(|d| d.is_error() && d.span().is_within(place))
     }
 
     /// Experiments of the root file, in order.

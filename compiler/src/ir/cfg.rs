@@ -10,7 +10,7 @@
 
 use super::{Func, Op, Type, Value, Write, build, live, reads, verify};
 use crate::ir::hash::HashMap;
-use crate::ir::value_map::{ValueMap, ValueSet};
+use crate::ir::value_map::{Bits, ValueMap, ValueSet};
 use abi::{Layout, Slot};
 
 /// The block with this number; prints as `b3`.
@@ -478,37 +478,28 @@ impl Cfg {
         global.dedup();
         let mut number = ValueMap::new(self.ops.len());
         global.iter().enumerate().for_each(|(k, value)| _ = number.insert(*value, k));
-        // A bit for each global value.
-        let words = global.len().div_ceil(64);
         let bits = |values: &mut dyn Iterator<Item = Value>| {
-            let mut bits = vec![0u64; words];
-            values.filter_map(|value| number.get(value)).for_each(|k| bits[k / 64] |= 1 << (k % 64));
+            let mut bits = Bits::new(global.len());
+            values.filter_map(|value| number.get(value)).for_each(|k| bits.insert(k));
             bits
         };
-        let read: Vec<Vec<u64>> = read.into_iter().map(|values| bits(&mut values.into_iter())).collect();
         let own =
             |block: &Block| bits(&mut block.params.iter().copied().chain(block.insts.iter().filter_map(Inst::defines)));
-        let own: Vec<Vec<u64>> = self.blocks.iter().map(own).collect();
-        let (mut live_in, mut live_out) = (read.clone(), vec![vec![0u64; words]; self.blocks.len()]);
-        let mut changed = words > 0;
+        let own: Vec<Bits> = self.blocks.iter().map(own).collect();
+        // Both sets of a block only grow, from what it reads itself.
+        let mut live_in: Vec<Bits> = read.into_iter().map(|values| bits(&mut values.into_iter())).collect();
+        let mut live_out = vec![Bits::new(global.len()); self.blocks.len()];
+        let mut changed = !global.is_empty();
         while std::mem::take(&mut changed) {
             for id in order.iter().rev().map(|id| id.index()) {
-                self.blocks[id].end.each_target(&mut |target, _| {
-                    live_out[id].iter_mut().zip(&live_in[target.index()]).for_each(|(out, live)| *out |= live);
-                });
-                for word in 0..words {
-                    let live = read[id][word] | live_out[id][word] & !own[id][word];
-                    changed |= std::mem::replace(&mut live_in[id][word], live) != live;
-                }
+                self.blocks[id].end.each_target(&mut |target, _| _ = live_out[id].unite(&live_in[target.index()]));
+                let mut through = live_out[id].clone();
+                through.subtract(&own[id]);
+                changed |= live_in[id].unite(&through);
             }
         }
-        let values = |bits: Vec<u64>| {
-            global
-                .iter()
-                .enumerate()
-                .filter(|(k, _)| bits[k / 64] >> (k % 64) & 1 != 0)
-                .map(|(_, value)| *value)
-                .collect()
+        let values = |bits: Bits| {
+            global.iter().enumerate().filter(|(k, _)| bits.contains(*k)).map(|(_, value)| *value).collect()
         };
         live_out.into_iter().map(values).collect()
     }

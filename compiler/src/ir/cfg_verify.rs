@@ -4,7 +4,7 @@
 //! as a parameter; a block computes a value once; arguments fit parameters in number and type; a slot is loaded before it is stored; calls go to pieces.
 
 use super::cfg::{Area, Block, BlockId, Cfg, Inst, Place, Terminator};
-use super::value_map::ValueSet;
+use super::value_map::{Bits, ValueSet};
 use super::{Op, Type, Value, verify};
 
 /// Checks a graph.
@@ -81,8 +81,8 @@ fn paths(cfg: &Cfg, entry: BlockId) -> Result<(), String> {
     let slots = cfg.blocks.iter().map(stores).max().unwrap_or(0);
     // For each block what is available, and which slots may have been stored in this iteration, at its beginning.
     let mut available: Vec<Option<Bits>> = vec![None; cfg.blocks.len()];
-    let mut stored = vec![Bits::none(slots); cfg.blocks.len()];
-    available[entry.index()] = Some(Bits::none(cfg.ops.len()));
+    let mut stored = vec![Bits::new(slots); cfg.blocks.len()];
+    available[entry.index()] = Some(Bits::new(cfg.ops.len()));
     let mut changed = true;
     let mut result = Ok(());
     while std::mem::take(&mut changed) {
@@ -112,7 +112,9 @@ fn paths(cfg: &Cfg, entry: BlockId) -> Result<(), String> {
                     }
                     Inst::Reload(value, _) => now.insert(value.index()),
                     Inst::Store(..) | Inst::Write(_) | Inst::Call(_) => {
-                        stored_slot(inst).into_iter().for_each(|slot| stored_now.insert(slot));
+                        if let Some(slot) = stored_slot(inst) {
+                            stored_now.insert(slot);
+                        }
                     }
                 }
             }
@@ -123,11 +125,11 @@ fn paths(cfg: &Cfg, entry: BlockId) -> Result<(), String> {
             let head = if let Terminator::Repeat { again, .. } = &block.end { Some(again.block) } else { None };
             block.end.each_target(&mut |to, _| {
                 changed |= match &mut available[to.index()] {
-                    Some(before) => before.keep(&now),
+                    Some(before) => before.intersect(&now),
                     before => before.replace(now.clone()).is_none(),
                 };
                 if Some(to) != head {
-                    changed |= stored[to.index()].add(&stored_now);
+                    changed |= stored[to.index()].unite(&stored_now);
                 }
             });
         }
@@ -135,48 +137,11 @@ fn paths(cfg: &Cfg, entry: BlockId) -> Result<(), String> {
     result
 }
 
-/// The slot of the block that an instruction stores.
+/// The slot that an instruction writes, if it stores to the model's block of numbers.
 fn stored_slot(inst: &Inst) -> Option<usize> {
     match inst {
         Inst::Store(Place { area: Area::Block, index, .. }, _) => Some(*index as usize),
         _ => None,
-    }
-}
-
-/// A set of numbers below a bound, a bit for each. Each block copies one and each edge joins two: in trees this took a
-/// quarter of the time of tests that compile.
-#[derive(Clone)]
-struct Bits(Vec<u64>);
-
-impl Bits {
-    fn none(bound: usize) -> Bits {
-        Bits(vec![0; bound.div_ceil(64)])
-    }
-
-    fn insert(&mut self, number: usize) {
-        self.0[number / 64] |= 1 << (number % 64);
-    }
-
-    fn contains(&self, number: usize) -> bool {
-        self.0.get(number / 64).is_some_and(|word| word >> (number % 64) & 1 != 0)
-    }
-
-    /// Keeps what is in another set too; whether it loses anything.
-    fn keep(&mut self, other: &Bits) -> bool {
-        self.update(other, |word, other| word & other)
-    }
-
-    /// Adds what is in another set; whether it gains anything.
-    fn add(&mut self, other: &Bits) -> bool {
-        self.update(other, |word, other| word | other)
-    }
-
-    fn update(&mut self, other: &Bits, joined: fn(u64, u64) -> u64) -> bool {
-        let words = self.0.iter_mut().zip(&other.0);
-        words.fold(false, |changed, (word, other)| {
-            let new = joined(*word, *other);
-            std::mem::replace(word, new) != new || changed
-        })
     }
 }
 

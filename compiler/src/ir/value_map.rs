@@ -1,7 +1,8 @@
 //! Maps and sets of the values of one function, without hashing.
 //!
 //! A map has an entry for every value of the function, so it is made once for many small uses and cleared in between:
-//! that costs as much as was inserted.
+//! that costs as much as was inserted. [`Bits`] are for data-flow equations, whose sets are copied for each block and
+//! joined at each edge.
 
 use super::Value;
 
@@ -61,5 +62,49 @@ impl ValueSet {
     /// Inserts values.
     pub fn add(&mut self, values: impl IntoIterator<Item = Value>) {
         values.into_iter().for_each(|value| _ = self.insert(value, ()));
+    }
+}
+
+/// A set of numbers below a bound, a bit for each. Sets that are joined have the same bound.
+#[derive(Clone)]
+pub struct Bits(Vec<u64>);
+
+impl Bits {
+    /// The empty set of numbers below a bound.
+    pub fn new(bound: usize) -> Bits {
+        Bits(vec![0; bound.div_ceil(64)])
+    }
+
+    /// Inserts a number below the bound.
+    pub fn insert(&mut self, number: usize) {
+        self.0[number / 64] |= 1 << (number % 64);
+    }
+
+    /// Whether a number, of any size, is a member.
+    pub fn contains(&self, number: usize) -> bool {
+        self.0.get(number / 64).is_some_and(|word| word >> (number % 64) & 1 != 0)
+    }
+
+    /// Removes all members that another set lacks. Returns whether this set has changed.
+    pub fn intersect(&mut self, other: &Bits) -> bool {
+        self.update(other, |word, other| word & other)
+    }
+
+    /// Inserts the members of another set. Returns whether this set has changed.
+    pub fn unite(&mut self, other: &Bits) -> bool {
+        self.update(other, |word, other| word | other)
+    }
+
+    /// Removes the members of another set. Returns whether this set has changed.
+    pub fn subtract(&mut self, other: &Bits) -> bool {
+        self.update(other, |word, other| word & !other)
+    }
+
+    fn update(&mut self, other: &Bits, joined: fn(u64, u64) -> u64) -> bool {
+        let words = self.0.iter_mut().zip(&other.0);
+        words.fold(false, |changed, (word, other)| {
+            let new = joined(*word, *other);
+            std::mem::replace(word, new) != new || changed
+        })
     }
 }

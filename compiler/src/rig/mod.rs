@@ -198,7 +198,7 @@ pub fn read<'a>(
 ) -> Option<PartitionedRig> {
     diagnostics.extend(prepared.diagnostics.iter().cloned());
     let rig = prepared.rig();
-    let misread = loaded.diagnostics.iter().any(|d| d.is_error() && d.span().is_within(rig.span));
+    let misread = loaded.misread(rig.span);
     let statements = Statements::of(rig, misread, diagnostics)?;
     let mut reader = RigReader {
         loaded,

@@ -313,7 +313,7 @@ impl<'a> Flattener<'a> {
             span: name.span,
             instance: id,
             kind,
-            unreadable: declaration.unit.is_some() && unit.is_none() || self.misread(declaration.span),
+            unreadable: declaration.unit.is_some() && unit.is_none() || self.loaded.misread(declaration.span),
             unit,
             shown,
             range: VarRange::default(),
@@ -350,14 +350,6 @@ impl<'a> Flattener<'a> {
     pub(super) fn add_var(&mut self, var: Var) -> VarId {
         self.system.vars.push(var);
         VarId(self.system.vars.len() as u32 - 1)
-    }
-
-    /// Whether a syntax error lies within this span.
-    pub(super) fn misread(&self, place: Span) -> bool {
-        self.loaded.diagnostics.iter().any(|d| {
-            let span = d.span();
-            d.is_error() && span.file == place.file && place.start <= span.start && span.end <= place.end
-        })
     }
 
     /// The span of a declared unit including its brackets.

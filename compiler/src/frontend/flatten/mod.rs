@@ -106,6 +106,15 @@ pub enum OverrideValue<'a> {
     Instance(&'a ast::Instance),
 }
 
+impl<'a> From<&'a ast::BindValue> for OverrideValue<'a> {
+    fn from(value: &'a ast::BindValue) -> OverrideValue<'a> {
+        match value {
+            ast::BindValue::Expr(expr) => OverrideValue::Expr(expr),
+            ast::BindValue::Instance(instance) => OverrideValue::Instance(instance),
+        }
+    }
+}
+
 /// Result of flattening.
 pub struct Flattened {
     /// The system; complete only if there are no errors.
@@ -552,10 +561,7 @@ fn changes_of<'a>(args: &'a [ast::Bind], env: &Env) -> Vec<Change<'a>> {
         Some(Change {
             path: &bind.inner.as_ref()?.segments,
             span: bind.span,
-            value: match &bind.value {
-                ast::BindValue::Expr(expr) => OverrideValue::Expr(expr),
-                ast::BindValue::Instance(instance) => OverrideValue::Instance(instance),
-            },
+            value: (&bind.value).into(),
             env: env.clone(),
         })
     };
