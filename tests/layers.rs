@@ -81,6 +81,7 @@ const HOMES: &[(&str, &[&str])] = &[
     ("textwrap", &["src/report.rs"]),
     // A socket begins as a request.
     ("tungstenite", &["panel/src/http.rs", "panel/src/viewer.rs"]),
+    ("zmij", &["abi/src/format.rs"]),
 ];
 
 type Module = Vec<String>;

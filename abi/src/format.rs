@@ -89,10 +89,19 @@ pub fn count(n: u64) -> String {
 /// The shortest decimal that parses to the same number, with an exponent where that is far shorter: for files.
 pub fn plain(value: f64) -> String {
     let magnitude = value.abs();
-    if magnitude == 0.0 || (1e-4..1e15).contains(&magnitude) || !magnitude.is_finite() {
-        value.to_string()
-    } else {
+    if magnitude == 0.0 || !magnitude.is_finite() {
+        return value.to_string();
+    }
+    let mut buffer = zmij::Buffer::new();
+    let text = buffer.format_finite(value);
+    let has_exponent = !(1e-4..1e15).contains(&magnitude);
+    // The library begins exponents elsewhere, and writes the sign of positive ones.
+    if text.contains('e') == has_exponent && !text.contains('+') {
+        text.strip_suffix(".0").unwrap_or(text).into()
+    } else if has_exponent {
         format!("{value:e}")
+    } else {
+        value.to_string()
     }
 }
 
@@ -207,6 +216,26 @@ mod tests {
             assert_eq!(plain(value).parse::<f64>().unwrap().to_bits(), value.to_bits());
         }
         assert_eq!(plain(1e-5), "1e-5");
+    }
+
+    /// The library that finds the digits changes neither their number nor where exponents begin. It rounds to the even digit
+    /// where two decimals of that length are equally near. A mutant with the limits of the library fails.
+    #[test]
+    fn plain_numbers_have_the_form_of_the_standard_library() {
+        let mut state = 1_u64;
+        for case in 0..400_000 {
+            state = state.wrapping_mul(6364136223846793005).wrapping_add(1442695040888963407);
+            // All bits, or numbers of usual size with few digits.
+            let value = match case % 2 {
+                0 => f64::from_bits(state),
+                _ => format!("{}e{}", (state >> 44) as i64 - 500_000, (state % 29) as i32 - 20).parse().unwrap(),
+            };
+            let is_short = value == 0.0 || !value.is_finite() || (1e-4..1e15).contains(&value.abs());
+            let (found, expected) = (plain(value), if is_short { value.to_string() } else { format!("{value:e}") });
+            let is_equally_near = found.len() == expected.len();
+            let reads_back = found.parse::<f64>().is_ok_and(|read| read == value);
+            assert!(found == expected || is_equally_near && reads_back, "case {case}: {found}, not {expected}");
+        }
     }
 
     #[test]

@@ -2,7 +2,7 @@
 
 use super::scale::Scale;
 use super::{Curve, Figure, GREYS, Lines, Look, PALETTE, Panel, RECORDED, SHADES, decimate};
-use std::fmt::Write;
+use std::fmt::{Display, Write};
 
 /// Width of a figure in px.
 const WIDTH: f64 = 860.0;
@@ -107,7 +107,7 @@ pub fn inline(figure: &Figure, look: &Look, wide: f64, id: &str) -> String {
     // The size of a figure for print is physical: 96 px are an inch.
     let (width, height) = match look.size {
         Some((wide, tall)) => (format!("{:.2}mm", wide * 25.4 / 96.0), format!("{:.2}mm", tall * 25.4 / 96.0)),
-        None => (tenth(wide), tenth(tall)),
+        None => (tenth(wide).to_string(), tenth(tall).to_string()),
     };
     format!(
         "<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"{width}\" height=\"{height}\" viewBox=\"0 0 {} {}\" \
@@ -468,7 +468,7 @@ fn stroke(panel: &Panel, i: usize, rank: usize, pen: Pen) -> String {
     if pattern.is_empty() {
         return format!("stroke=\"{colour}\"");
     }
-    let pattern: Vec<String> = pattern.iter().map(|length| tenth(length * pen.k)).collect();
+    let pattern: Vec<String> = pattern.iter().map(|length| tenth(length * pen.k).to_string()).collect();
     format!("stroke=\"{colour}\" stroke-dasharray=\"{}\"", pattern.join(" "))
 }
 
@@ -610,10 +610,22 @@ fn merged(stretches: &[(f64, f64)], least: f64) -> Vec<(f64, f64)> {
     joined
 }
 
-/// One decimal, without a trailing `.0`.
-fn tenth(x: f64) -> String {
-    let text = format!("{x:.1}");
-    text.strip_suffix(".0").map_or(text.clone(), str::to_string)
+/// A number with one decimal, without a trailing `.0`.
+fn tenth(x: f64) -> impl Display {
+    std::fmt::from_fn(move |to| {
+        let tenths = 10.0 * x;
+        let nearest = tenths.round_ties_even();
+        // The product is rounded: near a half, and for large numbers, the exact decimal decides.
+        if nearest.abs() > 1e9 || (tenths - nearest).abs() > 0.499_999 || nearest == 0.0 {
+            let text = format!("{x:.1}");
+            return to.write_str(text.strip_suffix(".0").unwrap_or(&text));
+        }
+        let (whole, tenth) = (nearest.abs() as u64 / 10, nearest.abs() as u64 % 10);
+        if nearest < 0.0 {
+            to.write_char('-')?;
+        }
+        if tenth == 0 { write!(to, "{whole}") } else { write!(to, "{whole}.{tenth}") }
+    })
 }
 
 fn text(out: &mut String, x: f64, y: f64, anchor: &str, style: &str, words: &str) {
@@ -666,4 +678,26 @@ fn fitted(text: &str, width: f64, size: f64) -> String {
         kept.pop();
     }
     kept + "…"
+}
+
+#[cfg(test)]
+mod tests {
+    use super::tenth;
+
+    /// A mutant that rounds the product alone fails at the first halves.
+    #[test]
+    fn tenths_are_rounded_as_by_the_standard_library() {
+        let mut state = 1_u64;
+        for case in 0..400_000 {
+            state = state.wrapping_mul(6364136223846793005).wrapping_add(1442695040888963407);
+            let number = (state >> 40) as i64 - (1 << 23);
+            // Twentieths, whose halves are rounded, and numbers of all sizes.
+            let x = match case % 2 {
+                0 => 0.05 * number as f64,
+                _ => format!("{number}e{}", (state % 20) as i32 - 12).parse().unwrap(),
+            };
+            let expected = format!("{x:.1}");
+            assert_eq!(tenth(x).to_string(), expected.strip_suffix(".0").unwrap_or(&expected), "case {case}: {x:e}");
+        }
+    }
 }
