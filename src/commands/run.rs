@@ -207,10 +207,11 @@ fn experiment(
     // Files are written before anything is said: they exist even if the reader of our output has gone.
     let errors = !args.trust.no_error;
     let picture = args.plot.as_ref().filter(|_| together.is_none());
+    let draws = talking || args.plot.is_some() || folder(args).is_some();
     let files = |cases: &[Case], kept: &[Kept]| {
         let begin = Instant::now();
         let recorded = figure::recorded(cases, kept);
-        let drawn = drawn(name, cases, &recorded, &args.look);
+        let drawn = draws.then(|| drawn(name, cases, &recorded, &args.look)).flatten();
         let written = write(args, name, cases, &recorded, &grids, drawn.as_ref(), picture);
         (drawn, written, begin.elapsed().as_secs_f64())
     };
@@ -371,6 +372,12 @@ fn show(picture: Option<&Path>, terminal: &mut Terminal) {
 /// Most rows of the data that the default folder gets without being asked.
 const UNASKED_ROWS: u64 = 100_000;
 
+/// The folder for a plot and the data of each experiment: the requested one, or one where nothing else is requested.
+fn folder(args: &Run) -> Option<PathBuf> {
+    let by_default = args.plot.is_none() && args.data.is_none() && !args.json;
+    args.out.clone().or(by_default.then(|| PathBuf::from("out")))
+}
+
 /// Writes the requested files, or returns the one that failed and why. `grids`: the instants of each case in s, where
 /// rows are requested on a time grid.
 fn write(
@@ -382,8 +389,7 @@ fn write(
     drawn: Option<&Figure>,
     picture: Option<&PathBuf>,
 ) -> Result<Written, (PathBuf, String)> {
-    let by_default = args.plot.is_none() && args.data.is_none() && !args.json;
-    let folder = args.out.clone().or(by_default.then(|| PathBuf::from("out")));
+    let folder = folder(args);
     let mut written = Written::default();
     let pictures = folder.iter().map(|folder| folder.join(format!("{name}.svg"))).chain(picture.cloned());
     for (path, figure) in pictures.zip(std::iter::repeat(drawn)).filter_map(|(path, drawn)| Some((path, drawn?))) {

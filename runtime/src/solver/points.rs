@@ -452,10 +452,12 @@ impl Points {
             straight &= is_within(self.columns[i].bend);
             looks_straight &= is_within(BEND);
             // On the parabola through the three points, with −1 at a and 1 at b.
-            let turn = 0.5 * (a - b) / bend;
-            let beyond = 0.25 * (b - a) * turn;
-            if turn.abs() < 1.0 && beyond.abs() > 1e-9 * span {
-                self.turns.push((middle + 0.5 * turn * (to - from), i));
+            if 0.5 * (a - b).abs() < bend.abs() {
+                let turn = 0.5 * (a - b) / bend;
+                let beyond = 0.25 * (b - a) * turn;
+                if turn.abs() < 1.0 && beyond.abs() > 1e-9 * span {
+                    self.turns.push((middle + 0.5 * turn * (to - from), i));
+                }
             }
         }
         if !straight && depth > 1 {
@@ -534,10 +536,17 @@ impl Points {
         }
         let width = self.slots.len();
         let is_known = self.node == Some((theta, time));
-        let last = &self.nodes[6 * width..];
+        let (last, values) = (&self.nodes[6 * width..], &mut self.rows[row * width..][..width]);
         if is_known && last.iter().all(|value| value.is_finite()) {
-            self.rows[row * width..][..width].copy_from_slice(last);
+            values.copy_from_slice(last);
             return Ok(());
+        }
+        if self.only_states {
+            let states = self.columns.iter().filter_map(|column| column.state);
+            values.iter_mut().zip(states).for_each(|(value, state)| *value = step.state_at(state, theta));
+            if values.iter().all(|value| value.is_finite()) {
+                return Ok(());
+            }
         }
         step.at(theta, &mut self.x);
         system.place(time, &self.x);
