@@ -17,6 +17,7 @@ mod support;
 
 use abi::description::Guard;
 use abi::plan::Method;
+use abi::table::Code;
 use abi::{Function, Instance, Slice, Slot};
 use compiler::Changes;
 use compiler::codegen::tiering::{Policy, tiered};
@@ -37,10 +38,18 @@ fn variant(name: &str, text: &str, experiment: &str, changes: Changes) -> Option
     read.ok()?.into_iter().next().filter(|variant| variant.rig.is_none())
 }
 
-/// The final block, what was measured, how the run ended, and what it recorded.
-fn run(variant: &Variant, policy: Policy) -> (Vec<u64>, String, Recording) {
+/// The reference, or tiered code.
+fn code(variant: &Variant, policy: Option<Policy>) -> Code {
     let (program, method) = (&variant.program, variant.experiment.solver.method);
-    let code = tiered(program, method, policy);
+    match policy {
+        Some(policy) => tiered(program, method, policy),
+        None => compiler::code(&compiler::functions(program, method), &program.description, true).0,
+    }
+}
+
+/// The final block, what was measured, how the run ended, and what it recorded.
+fn run(variant: &Variant, policy: Option<Policy>) -> (Vec<u64>, String, Recording) {
+    let (program, code) = (&variant.program, code(variant, policy));
     let instance = Instance::new(Arc::new(program.description.clone()), code, &program.params);
     let mut watch = |_| Continue::Continue(());
     let (instance, ended) = runtime::engine::run_on(instance, &variant.experiment, &mut |_| (), &mut watch);
@@ -52,9 +61,9 @@ fn run(variant: &Variant, policy: Policy) -> (Vec<u64>, String, Recording) {
 }
 
 /// The status of each of several calls for so many steps, and the block after it.
-fn advanced(variant: &Variant, policy: Policy, calls: &[u64]) -> Vec<(u64, Vec<u64>)> {
+fn advanced(variant: &Variant, policy: Option<Policy>, calls: &[u64]) -> Vec<(u64, Vec<u64>)> {
     let (program, solver) = (&variant.program, variant.experiment.solver);
-    let code = tiered(program, solver.method, policy);
+    let code = code(variant, policy);
     let mut instance = Instance::new(Arc::new(program.description.clone()), code, &program.params);
     instance.start(solver.step);
     let mut call = |count: &u64| (instance.advance(*count), instance.block().iter().map(bits).collect());
@@ -66,19 +75,17 @@ fn bits(x: &f64) -> u64 {
     if x.is_nan() { f64::NAN.to_bits() } else { x.to_bits() }
 }
 
-/// Functions that are compiled after a random number of runs, quickly and well, most often within the run.
+/// Functions that are compiled after a random number of runs, most often within the run.
 fn policy(random: &mut Random) -> Policy {
-    let mut thresholds = || {
-        Function::ALL.map(|_| match random.below(4) {
-            0 => None,
-            1 => Some(random.below(4) as u64),
-            2 => Some(random.below(100) as u64),
-            _ => Some(random.below(1000) as u64),
-        })
-    };
-    let (quickly_after, compiled_after) = (thresholds(), thresholds());
+    let compiled_after = Function::ALL.map(|_| match random.below(4) {
+        // Interpreted, in groups from some number of runs on.
+        0 => None,
+        1 => Some(random.below(4) as u64),
+        2 => Some(random.below(100) as u64),
+        _ => Some(random.below(1000) as u64),
+    });
     let runs_between_looks = 1 + random.below(8) as u64;
-    Policy { quickly_after, compiled_after, runs_between_looks, in_background: random.below(2) == 0 }
+    Policy { compiled_after, runs_between_looks, in_background: random.below(2) == 0 }
 }
 
 /// A seed's experiment of the library, or a random text: name, text, experiment.
@@ -238,10 +245,10 @@ fn the_bits_of_a_run_do_not_depend_on_when_its_functions_are_compiled() {
             variant.experiment.plots.clear();
             variant.experiment.expects.clear();
         }
-        let expected = run(&variant, Policy::NEVER);
+        let expected = run(&variant, None);
         let policy = policy(&mut random);
         compiled += u64::from(policy.compiled_after.iter().flatten().any(|after| *after < 100));
-        let found = run(&variant, policy.clone());
+        let found = run(&variant, Some(policy.clone()));
         assert_eq!(found, expected, "FRIC_SEED={seed} repeats it: {name}, {experiment}, {}, {policy:?}", method.name());
         runs += 1;
         if method == Method::Adaptive {
@@ -252,7 +259,8 @@ fn the_bits_of_a_run_do_not_depend_on_when_its_functions_are_compiled() {
         let after = Some(random.below(60) as u64);
         let mut policy = Policy { runs_between_looks: 1 + random.below(3) as u64, in_background: false, ..policy };
         policy.compiled_after[Function::Step as usize] = after;
-        let (found, expected) = (advanced(&variant, policy.clone(), &calls), advanced(&variant, Policy::NEVER, &calls));
+        let found = advanced(&variant, Some(policy.clone()), &calls);
+        let expected = advanced(&variant, None, &calls);
         assert_eq!(found, expected, "FRIC_SEED={seed} repeats it: {name}, {experiment}, {calls:?}, {policy:?}");
     }
     let all = seeds.end - seeds.start;

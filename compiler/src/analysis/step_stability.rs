@@ -11,11 +11,12 @@
 //! machine.
 
 use crate::analysis::memo::Memo;
+use crate::codegen::grouped::run_while;
 use crate::ir::Func;
 use crate::ir::build::{Build, Env};
 use crate::ir::expr::Shared;
 use crate::ir::hash::HashMap;
-use crate::ir::interpret::{run_each, run_once, run_while};
+use crate::ir::interpret::{run_each, run_once};
 use crate::ir::program::Program;
 use crate::math::expand;
 use crate::numerics::autodiff;

@@ -25,18 +25,6 @@ pub struct Options {
     pub lengths: Lengths,
     /// Names of passes to leave out: for measurements.
     pub off: Vec<String>,
-    /// How registers are allocated.
-    pub registers: Registers,
-}
-
-/// How Cranelift allocates registers; the bits of the results are the same.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub enum Registers {
-    /// With backtracking: most of the time of a compilation, and the fastest code.
-    #[default]
-    Backtracking,
-    /// In a single pass: an adaptive step is compiled in a third of the time, and takes some 1.6 times as long.
-    SinglePass,
 }
 
 impl Options {

@@ -4,7 +4,7 @@
 //! both at once, and is freed when the last clone of the code is dropped. The code has no symbols, calls nothing except
 //! its own pieces and needs no relocation at run time.
 
-use super::target::{Bytes, FunctionCompiler, here, here_with};
+use super::target::{Bytes, FunctionCompiler, here};
 use crate::codegen::emit::signature;
 use crate::codegen::executable_memory::{Executable, Memory};
 use crate::codegen::forms::{Context, Form, Options};
@@ -87,7 +87,7 @@ pub fn compile_with(
 fn distributed(step: &Func, layout: &Layout, pool_len: usize, options: &Options) -> Option<DistributedStep> {
     let graph = passes::run(step, Form::Distributed, Called::Several, &Context { layout: Some(layout), options });
     let leading = leading(graph.leading.as_ref()?, pool_len)?;
-    let (entry, executable) = remaining(step, &graph, &leading, options)?;
+    let (entry, executable) = remaining(step, &graph, &leading)?;
     // SAFETY: `entry` is the start of code with the signature of `RemainingEntry`.
     let entry = unsafe { std::mem::transmute::<*const u8, RemainingEntry>(entry) };
     // SAFETY: the entry lives as long as its memory; `loop_distribution` keeps every access to block and pool as it was in
@@ -120,13 +120,8 @@ fn leading(leading: &Leading, pool_len: usize) -> Option<LeadingLoop> {
 }
 
 /// Compiles the remaining loop that goes with a leading one; returns the address of its entry, and its memory.
-fn remaining(
-    step: &Func,
-    graph: &Cfg,
-    leading: &LeadingLoop,
-    options: &Options,
-) -> Option<(*const u8, Arc<Executable>)> {
-    let mut compiler = FunctionCompiler::new(here_with(options.registers).ok()?);
+fn remaining(step: &Func, graph: &Cfg, leading: &LeadingLoop) -> Option<(*const u8, Arc<Executable>)> {
+    let mut compiler = FunctionCompiler::new(here().ok()?);
     let bytes = compiler.remaining_loop(step, graph, leading.instants.width()).ok()?;
     let executable = Executable::new(&bytes.code, bytes.alignment as u64).ok()?;
     Some((executable.address(), Arc::new(executable)))
@@ -161,7 +156,7 @@ pub fn follow(
     let graph = passes::run_on_rows(step, rows, Form::Distributed, &context);
     let ahead = graph.leading.as_ref().and_then(|found| {
         let leading = leading(found, pool_len)?;
-        let (entry, executable) = remaining(step, &graph, &leading, &options)?;
+        let (entry, executable) = remaining(step, &graph, &leading)?;
         // SAFETY: `entry` is the start of code with the signature of `RemainingFollowEntry`.
         let entry = unsafe { std::mem::transmute::<*const u8, RemainingFollowEntry>(entry) };
         // SAFETY: as for the step.
@@ -183,7 +178,7 @@ fn generate(
     options: &Options,
     prepares: bool,
 ) -> Result<(Entries, Option<Prepared>, Memory, Stats), Unsupported> {
-    let isa = here_with(options.registers)?;
+    let isa = here()?;
     let mut memory = Memory::new(isa);
     let module = memory.module();
     let mut compiler = FunctionCompiler::new(isa);

@@ -6,7 +6,8 @@
 //! `emit_f64x2`, `target`, `jit` and `executable_memory` know Cranelift.
 //!
 //! ```text
-//! tiering             interprets a function first; calls jit once it has run often enough
+//! tiering             interprets a function first; calls grouped and jit once it has run often enough
+//! grouped             an interpreter whose order of operations the processor predicts
 //! jit, image → target one function after the other: passes → emit → Cranelift
 //!   passes            the list of all passes over control-flow graphs, in order
 //! lanes               isel → schedule → regalloc → assembler, or emit_f64x2 → Cranelift
@@ -40,6 +41,7 @@ pub mod jit;
 pub mod image;
 pub mod c;
 pub mod python;
+pub mod grouped;
 pub mod tiering;
 pub mod pass_report;
 pub mod elementary;

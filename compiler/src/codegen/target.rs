@@ -7,7 +7,7 @@ use super::unsupported::Unsupported;
 use crate::codegen::emit::Emitter;
 use crate::codegen::emit_f64x2;
 use crate::codegen::form_loop::is_idempotent;
-use crate::codegen::forms::{Context as Passes, Form, Options, Registers};
+use crate::codegen::forms::{Context as Passes, Form, Options};
 use crate::codegen::passes;
 use crate::ir::Func;
 use crate::ir::cfg::{BlockId, Cfg, Entry, Inst, Rows};
@@ -314,22 +314,11 @@ pub fn most_lanes() -> usize {
 
 /// The processor that this program runs on, with all features it has.
 pub fn here() -> Result<&'static OwnedTargetIsa, Unsupported> {
-    here_with(Registers::default())
+    static HERE: OnceLock<Result<OwnedTargetIsa, Unsupported>> = OnceLock::new();
+    HERE.get_or_init(native).as_ref().map_err(Clone::clone)
 }
 
-/// The same, with a way to allocate registers.
-pub fn here_with(registers: Registers) -> Result<&'static OwnedTargetIsa, Unsupported> {
-    type Native = OnceLock<Result<OwnedTargetIsa, Unsupported>>;
-    static BACKTRACKING: Native = OnceLock::new();
-    static SINGLE_PASS: Native = OnceLock::new();
-    let isa = match registers {
-        Registers::Backtracking => &BACKTRACKING,
-        Registers::SinglePass => &SINGLE_PASS,
-    };
-    isa.get_or_init(|| native(registers)).as_ref().map_err(Clone::clone)
-}
-
-fn native(registers: Registers) -> Result<OwnedTargetIsa, Unsupported> {
+fn native() -> Result<OwnedTargetIsa, Unsupported> {
     if most_lanes() == 0 {
         return Err(Unsupported("FRIC_LANES=0 asks for the interpreter".into()));
     }
@@ -341,7 +330,7 @@ fn native(registers: Registers) -> Result<OwnedTargetIsa, Unsupported> {
         }
     }
     let native = cranelift_native::builder().map_err(|what| Unsupported(what.into()))?;
-    native.finish(flags(registers)).map_err(|what| Unsupported(what.to_string()))
+    native.finish(flags()).map_err(|what| Unsupported(what.to_string()))
 }
 
 /// A target with features beyond those it requires.
@@ -367,16 +356,15 @@ pub fn with(target: Target, more: &[Feature]) -> OwnedTargetIsa {
         };
         isa.enable(flag).expect("a flag of this version");
     }
-    isa.finish(flags(Registers::default())).expect("flags that fit together")
+    isa.finish(flags()).expect("flags that fit together")
 }
 
-fn flags(registers: Registers) -> Flags {
+fn flags() -> Flags {
     let mut flags = builder();
     for (flag, setting) in [
         // Our own passes have already shared, folded and ordered the operations. With its optimiser on, Cranelift
         // merges equal constants and moves computations to their uses: that raises register pressure and causes spills.
         ("opt_level", "none"),
-        ("regalloc_algorithm", if registers == Registers::SinglePass { "single_pass" } else { "backtracking" }),
         ("is_pic", "false"),
         // A frame larger than a page is probed page by page, inline.
         ("enable_probestack", "true"),

@@ -6,7 +6,7 @@
 //! Compare Arnold, Fink, Grove, Hind, Sweeney, *A Survey of Adaptive Optimization in Virtual Machines*, Proc. IEEE,
 //! 2005.
 
-use crate::codegen::forms::{Options, Registers};
+use crate::codegen::grouped::Grouped;
 use crate::codegen::lanes::{self, Width};
 use crate::codegen::{jit, target};
 use crate::ir::Func;
@@ -29,25 +29,33 @@ use std::thread::Builder;
 
 /// The functions that a method needs, expanded to arithmetic.
 pub fn functions(program: &Program, method: Method) -> Vec<(Function, Func)> {
-    Function::ALL.into_iter().filter_map(|which| Some((which, function(program, method, which)?))).collect()
+    let expanded = |which| Some((which, expanded(which, &function(program, method, which)?)));
+    Function::ALL.into_iter().filter_map(expanded).collect()
 }
 
-/// One function, expanded to arithmetic; none if the method does not need it.
+/// One function, before elementary functions are expanded; none if the method does not need it.
 fn function(program: &Program, method: Method, which: Function) -> Option<Func> {
     if !needs(program, method, which) {
         return None;
     }
-    let expanded = |func: &Option<Func>| func.as_ref().map(math::expand);
     match which {
-        Function::Start => Some(math::expand(&program.start)),
-        Function::Outputs => Some(math::expand(&program.outputs)),
-        Function::Transitions => expanded(&program.transitions),
-        Function::Derivatives => Some(math::expand(&program.derivatives)),
-        Function::Jacobian => Some(math::expand(&autodiff::jacobian(program))),
-        Function::Roots => expanded(&program.roots),
-        Function::Tick => expanded(&program.tick),
-        Function::Step => Some(math::expand(&step(program, method))),
-        Function::Rosenbrock => rosenbrock::rosenbrock(program).map(|step| rosenbrock::pooled(&math::expand(&step))),
+        Function::Start => Some(program.start.clone()),
+        Function::Outputs => Some(program.outputs.clone()),
+        Function::Transitions => program.transitions.clone(),
+        Function::Derivatives => Some(program.derivatives.clone()),
+        Function::Jacobian => Some(autodiff::jacobian(program)),
+        Function::Roots => program.roots.clone(),
+        Function::Tick => program.tick.clone(),
+        Function::Step => Some(step(program, method)),
+        Function::Rosenbrock => rosenbrock::rosenbrock(program),
+    }
+}
+
+/// A function with its elementary functions expanded.
+fn expanded(which: Function, func: &Func) -> Func {
+    match which {
+        Function::Rosenbrock => rosenbrock::pooled(&math::expand(func)),
+        _ => math::expand(func),
     }
 }
 
@@ -153,17 +161,19 @@ pub fn code(functions: &[(Function, Func)], description: &Description, interpret
 }
 
 /// Tiered code, for runs that are not in real time: each function is built at its first call and interpreted until it
-/// has run so often that compiling pays. It is then compiled by a thread of its own while the interpreter continues. So
-/// a model makes its first step before anything is compiled, no run waits for code, and functions that run once, such
-/// as the start, are never compiled. The adaptive step is compiled twice: first with a register allocation in a single
-/// pass, which takes a third of the time.
+/// has run so often that compiling pays, in groups from the number of runs on where that pays ([`Grouped`]). It is then
+/// compiled by a thread of its own while the interpreter continues. So a model makes its first step before anything is
+/// compiled, no run waits for code, and functions that run once, such as the start, are never compiled. With `interpret`
+/// it is the reference, operation by operation.
 pub fn late(program: &Program, method: Method, interpret: bool) -> (Code, Vec<String>) {
     let size = program.derivatives.ops.len() + program.outputs.ops.len() + program.start.ops.len();
-    match target::here() {
-        // A program that may be too large for machine code is compiled at once, so that the note about it comes at
-        // once.
-        Ok(_) if !interpret && size <= MAX_TIERED_OPS => (on_demand(program, method, false), Vec::new()),
-        _ => code(&functions(program, method), &program.description, interpret),
+    if !interpret && size <= MAX_TIERED_OPS && target::here().is_ok() {
+        return (on_demand(program, method, false), Vec::new());
+    }
+    // A program that may be too large for machine code is compiled at once, so that the note about it comes at once.
+    match code(&functions(program, method), &program.description, interpret) {
+        (Code::Interpreted(_), notes) if !interpret => (on_demand(program, method, true), notes),
+        code => code,
     }
 }
 
@@ -191,37 +201,37 @@ pub type Thresholds = [Option<u64>; Function::ALL.len()];
 /// When the functions of tiered code are compiled. The bits of a run do not depend on it.
 #[derive(Clone, Debug)]
 pub struct Policy {
-    /// With registers allocated in a single pass.
-    pub quickly_after: Thresholds,
-    /// As well as possible.
+    /// How often functions are interpreted before.
     pub compiled_after: Thresholds,
-    /// Runs within one call of the interpreter or of quickly compiled code, at least 1, before it looks again whether to
-    /// compile and whether there is better code.
+    /// Runs within one call of the interpreter, at least 1, before it looks again whether to compile and whether there is
+    /// code.
     pub runs_between_looks: u64,
     /// Whether a thread of its own compiles, while the run continues; otherwise the next call waits for it.
     pub in_background: bool,
 }
 
 impl Policy {
-    /// Everything is interpreted.
-    pub const NEVER: Policy = Policy {
-        quickly_after: [None; Function::ALL.len()],
-        compiled_after: [None; Function::ALL.len()],
-        runs_between_looks: u64::MAX,
-        in_background: false,
-    };
+    /// Nothing is compiled.
+    pub const NEVER: Policy =
+        Policy { compiled_after: [None; Function::ALL.len()], runs_between_looks: u64::MAX, in_background: false };
 
     /// Compiles when the runs so far have lost nearly as much as compiling takes: interpreting an operation takes some
-    /// 2 ns, compiling it some 2 µs. Compiling an adaptive step takes some 12 ms, because the time of backtracking
-    /// register allocation grows faster than the length, and 4 ms with a single pass. An attempt then takes some 2.7 µs
-    /// interpreted, 1.5 µs by the quick code and 0.9 µs by the better one.
+    /// 0.7 ns longer than machine code does, compiling it some 2 µs. Compiling an adaptive step takes some 12 ms, because
+    /// the time of backtracking register allocation grows faster than the length.
     pub const USUAL: Policy = {
-        let (mut quickly_after, mut compiled_after) = ([None; Function::ALL.len()], [Some(800); Function::ALL.len()]);
-        quickly_after[Function::Rosenbrock as usize] = Some(400);
+        let mut compiled_after = [Some(800); Function::ALL.len()];
         compiled_after[Function::Rosenbrock as usize] = Some(15_000);
-        Policy { quickly_after, compiled_after, runs_between_looks: 64, in_background: true }
+        Policy { compiled_after, runs_between_looks: 64, in_background: true }
     };
 }
+
+/// For each function the number of runs after which it is interpreted in groups: grouping takes as long as some 50 runs.
+/// Adaptive steps are hardly ever fewer.
+const GROUPED_AFTER: [u64; Function::ALL.len()] = {
+    let mut after = [64; Function::ALL.len()];
+    after[Function::Rosenbrock as usize] = 0;
+    after
+};
 
 /// Code whose functions are compiled one by one.
 struct Tiered(Arc<Functions>);
@@ -249,35 +259,28 @@ struct Recording {
 /// The forms of one function, each built when it is first needed.
 #[derive(Default)]
 struct Forms {
-    func: OnceLock<Option<(Function, Func)>>,
+    /// Before elementary functions are expanded, and afterwards.
+    func: OnceLock<Option<Func>>,
+    expanded: OnceLock<(Function, Func)>,
     interpreter: OnceLock<Interpreter>,
-    quick: Compiled,
-    best: Compiled,
-    /// Number of iterations run so far.
-    runs: AtomicU64,
-}
-
-/// A form of machine code.
-#[derive(Default)]
-struct Compiled {
+    grouped: OnceLock<Grouped>,
     /// The inner `None` means that the function is too large.
     machine: OnceLock<Option<Machine>>,
     /// Whether somebody compiles it or has done so.
     is_claimed: AtomicBool,
-}
-
-impl Compiled {
-    /// The code, if it has been compiled and the function is not too large.
-    fn machine(&self) -> Option<&Machine> {
-        self.machine.get()?.as_ref()
-    }
+    /// Number of iterations run so far.
+    runs: AtomicU64,
 }
 
 impl Functions {
-    /// The function, expanded to arithmetic.
-    fn func(&self, which: Function) -> Option<&(Function, Func)> {
-        let make = || Some((which, function(&self.program, self.method, which)?));
-        self.forms[which as usize].func.get_or_init(make).as_ref()
+    /// The function, before elementary functions are expanded.
+    fn func(&self, which: Function) -> Option<&Func> {
+        self.forms[which as usize].func.get_or_init(|| function(&self.program, self.method, which)).as_ref()
+    }
+
+    /// The same where it is known to exist.
+    fn existing(&self, which: Function) -> &Func {
+        self.func(which).unwrap_or_else(|| panic!("the code has no function `{}`", which.name()))
     }
 
     /// Number of attempts at adaptive steps that the function has settled by itself so far: accepted or rejected.
@@ -286,34 +289,33 @@ impl Functions {
         trial.map_or(0, |trial| (block[trial.accepted().index()] + block[trial.refused().index()]) as u64)
     }
 
-    /// Passes one function to a back end.
+    /// Passes one function, expanded, to a back end.
     fn make<T>(&self, which: Function, back_end: impl FnOnce(&[(Function, Func)], &Layout, usize) -> T) -> T {
-        let func = self.func(which).unwrap_or_else(|| panic!("the code has no function `{}`", which.name()));
+        let expand = || (which, expanded(which, self.existing(which)));
+        let func = self.forms[which as usize].expanded.get_or_init(expand);
         back_end(std::slice::from_ref(func), &self.program.description.layout, self.program.description.pool.len())
     }
 
-    /// The better machine code of a function, if it has been compiled and is not too large for that.
-    fn best(&self, which: Function) -> Option<&Machine> {
-        self.forms[which as usize].best.machine()
-    }
-
-    /// Machine code of the form that goes with a way to allocate registers.
-    fn compiled(&self, which: Function, registers: Registers) -> &Compiled {
-        let forms = &self.forms[which as usize];
-        match registers {
-            Registers::SinglePass => &forms.quick,
-            Registers::Backtracking => &forms.best,
+    /// Interprets a function up to `count` times.
+    fn interpret(&self, which: Function, block: &mut [f64], pool: &[f64], count: u64) -> u64 {
+        let Forms { interpreter, grouped, runs, .. } = &self.forms[which as usize];
+        if runs.load(Ordering::Relaxed) < GROUPED_AFTER[which as usize] {
+            return interpreter.get_or_init(|| self.make(which, Interpreter::new)).call(which, block, pool, count);
         }
+        let Description { layout, pool: constants, .. } = &self.program.description;
+        grouped.get_or_init(|| Grouped::new(self.existing(which), layout, constants.len())).call(block, pool, count)
     }
 
-    fn compile(&self, which: Function, registers: Registers) {
-        let options = Options { registers, ..Options::default() };
-        // Quick code shares its calls with the interpreter, which makes no single steps with hoisted values.
-        let prepares = registers == Registers::Backtracking;
+    /// The machine code of a function, if it has been compiled and is not too large for that.
+    fn machine(&self, which: Function) -> Option<&Machine> {
+        self.forms[which as usize].machine.get()?.as_ref()
+    }
+
+    fn compile(&self, which: Function) {
         let make = |funcs: &[_], layout: &Layout, pool| {
-            jit::compile_with(funcs, layout, pool, &options, prepares).ok().map(|(machine, _)| machine)
+            jit::compile_prepared(funcs, layout, pool).ok().map(|(machine, _)| machine)
         };
-        self.compiled(which, registers).machine.get_or_init(|| self.make(which, make));
+        self.forms[which as usize].machine.get_or_init(|| self.make(which, make));
     }
 
     fn compile_recording(&self) {
@@ -332,16 +334,10 @@ impl Tiered {
         let (runs, policy) = (self.0.forms[which as usize].runs.load(Ordering::Relaxed), &self.0.policy);
         let records = which == Function::Step && self.0.recording.slots.get().is_some();
         let times = if records { BESIDE_RECORDING } else { 1 };
-        let pays = |thresholds: &Thresholds| thresholds[which as usize].is_some_and(|after| runs >= times * after);
-        let registers = match (pays(&policy.compiled_after), pays(&policy.quickly_after)) {
-            (true, _) => Registers::Backtracking,
-            (false, true) => Registers::SinglePass,
-            (false, false) => return,
-        };
-        if self.0.compiled(which, registers).is_claimed.swap(true, Ordering::Relaxed) {
-            return;
+        let pays = policy.compiled_after[which as usize].is_some_and(|after| runs >= times * after);
+        if pays && !self.0.forms[which as usize].is_claimed.swap(true, Ordering::Relaxed) {
+            self.compile(move |functions| functions.compile(which));
         }
-        self.compile(move |functions| functions.compile(which, registers));
     }
 
     /// Compiles in a thread of its own if the policy says so. Where no thread can be had, the caller compiles.
@@ -360,23 +356,17 @@ impl Interpret for Tiered {
         let settled = |block: &[f64]| self.0.settled(which, block);
         let mut left = count;
         loop {
-            if forms.best.machine.get().is_none() {
+            if forms.machine.get().is_none() {
                 self.consider(which);
             }
             // Machine code for a single step may leave the count to the caller, who stores it only after a single step.
-            let keeps_count = |runs| which != Function::Step || runs > 1 || count == 1;
-            if let Some(machine) = forms.best.machine().filter(|_| keeps_count(left)) {
+            let keeps_count = which != Function::Step || left > 1 || count == 1;
+            if let Some(machine) = self.0.machine(which).filter(|_| keeps_count) {
                 return machine.call(which, block, pool, left);
             }
             let runs = left.min(self.0.policy.runs_between_looks);
             let before = settled(block);
-            let status = match forms.quick.machine().filter(|_| keeps_count(runs)) {
-                Some(machine) => machine.call(which, block, pool, runs),
-                None => {
-                    let interpreter = forms.interpreter.get_or_init(|| self.0.make(which, Interpreter::new));
-                    interpreter.call(which, block, pool, runs)
-                }
-            };
+            let status = self.0.interpret(which, block, pool, runs);
             // A call for adaptive steps ends at the first step that it leaves open, most often long before `count`.
             let done = if which == Function::Rosenbrock { 1 + settled(block).saturating_sub(before) } else { runs };
             forms.runs.fetch_add(done, Ordering::Relaxed);
@@ -388,7 +378,7 @@ impl Interpret for Tiered {
     }
 
     fn made(&self, which: Function) -> Option<&Machine> {
-        self.0.best(which)
+        self.0.machine(which)
     }
 
     fn recording(&self, outputs: &[Slot]) -> Option<Arc<Follow>> {

@@ -13,7 +13,7 @@ use abi::table::Interpret;
 use abi::{Function, Layout, Slot};
 use std::array::from_fn;
 use std::cell::Cell;
-use std::ops::{ControlFlow, Deref};
+use std::ops::Deref;
 
 thread_local! {
     /// Scratch space for the values of a function, kept from call to call.
@@ -76,7 +76,7 @@ pub fn run_each<B: AsMut<[f64]> + AsRef<[f64]>>(func: &Func, blocks: &mut [B], p
         let bits = |block: &B| block.as_ref()[slot.index()].to_bits();
         others.iter().any(|other| bits(other) != bits(first))
     };
-    let mut residual = Residual::<AT_ONCE>::new(func, first.as_ref(), pool, differs);
+    let mut residual = Residual::new(func, first.as_ref(), pool, differs);
     for some in blocks.chunks_mut(AT_ONCE) {
         let mut some: Vec<&mut [f64]> = some.iter_mut().map(AsMut::as_mut).collect();
         for _ in 0..times {
@@ -85,39 +85,21 @@ pub fn run_each<B: AsMut<[f64]> + AsRef<[f64]>>(func: &Func, blocks: &mut [B], p
     }
 }
 
-/// Runs an expanded function up to `count` times, whatever its status, until `look` breaks, which sees the block after
-/// each time.
-pub fn run_while(
-    func: &Func,
-    block: &mut [f64],
-    pool: &[f64],
-    count: usize,
-    mut look: impl FnMut(&[f64]) -> ControlFlow<()>,
-) {
-    let mut residual = Residual::<1>::new(func, block, pool, |_| false);
-    for _ in 0..count {
-        residual.run(&mut [&mut *block], pool);
-        if look(block).is_break() {
-            return;
-        }
-    }
-}
-
 /// Number of blocks that [`run_each`] advances at once: the processor decodes an operation once for all of them, and
 /// their numbers fill vectors.
 const AT_ONCE: usize = 8;
 
-/// A function whose invariant operations have been evaluated, for runs on `N` blocks at once.
-struct Residual<'f, const N: usize> {
+/// A function whose invariant operations have been evaluated, for runs on several blocks at once.
+struct Residual<'f> {
     func: &'f Func,
     /// Indices of the other operations.
     rest: Vec<usize>,
-    values: Vec<[u64; N]>,
+    values: Vec<[u64; AT_ONCE]>,
 }
 
-impl<'f, const N: usize> Residual<'f, N> {
+impl<'f> Residual<'f> {
     /// `block`: any of the blocks; `differs`: whether they differ in a slot before the first run.
-    fn new(func: &'f Func, block: &[f64], pool: &[f64], differs: impl Fn(Slot) -> bool) -> Residual<'f, N> {
+    fn new(func: &'f Func, block: &[f64], pool: &[f64], differs: impl Fn(Slot) -> bool) -> Residual<'f> {
         let slots = Slots::new(func.stores.iter().map(|(slot, _)| *slot), None);
         let at_least = |i: usize| match func.ops[i] {
             Op::Load(slot) if differs(slot) => Variance::State,
@@ -125,17 +107,17 @@ impl<'f, const N: usize> Residual<'f, N> {
         };
         let variance = of_ops(&func.ops, &slots, at_least);
         let (once, rest): (Vec<usize>, Vec<usize>) = (0..func.ops.len()).partition(|i| variance[*i].is_invariant());
-        let mut values = vec![[0; N]; func.ops.len()];
+        let mut values = vec![[0; AT_ONCE]; func.ops.len()];
         operations(func, once.into_iter(), &[block], pool, &mut values);
         Residual { func, rest, values }
     }
 
-    /// Runs the function once on each block: at most `N`.
+    /// Runs the function once on each block: at most [`AT_ONCE`].
     fn run(&mut self, blocks: &mut [&mut [f64]], pool: &[f64]) {
         /// The same with instructions for fused products, for rounding to integers and for vectors.
         #[cfg(target_arch = "x86_64")]
         #[target_feature(enable = "fma,avx2")]
-        fn with_vectors<const N: usize>(of: &mut Residual<N>, blocks: &mut [&mut [f64]], pool: &[f64]) {
+        fn with_vectors(of: &mut Residual, blocks: &mut [&mut [f64]], pool: &[f64]) {
             of.all(blocks, pool);
         }
         #[cfg(target_arch = "x86_64")]
@@ -366,7 +348,7 @@ mod tests {
             let pool: Vec<f64> = (0..random::POOL_LEN).map(|_| random.real()).collect();
             let start: Vec<f64> = (0..random::layout().size()).map(|_| random.real()).collect();
             let (count, times) = (1 + random.below(2 * AT_ONCE), random.below(4));
-            let mut blocks = vec![start; count];
+            let mut blocks = vec![start.clone(); count];
             for block in &mut blocks {
                 block.iter_mut().skip(seed as usize % 3).step_by(3).for_each(|x| *x = random.real());
             }
@@ -374,14 +356,11 @@ mod tests {
             for block in &mut expected {
                 (0..times).for_each(|_| _ = run_once(&func, block, &pool));
             }
-            let mut alone = blocks[0].clone();
-            run_while(&func, &mut alone, &pool, times, |_| ControlFlow::Continue(()));
             run_each(&func, &mut blocks, &pool, times);
             let bits = |block: &Vec<f64>| block.iter().map(|x| if x.is_nan() { 1 } else { x.to_bits() }).collect();
             let [blocks, expected]: [Vec<Vec<u64>>; 2] = [blocks, expected].map(|all| all.iter().map(bits).collect());
             assert_eq!(blocks, expected, "seed {seed}\n{func}");
-            assert_eq!(bits(&alone), expected[0], "seed {seed}\n{func}");
-            let residual = Residual::<1>::new(&func, &alone, &pool, |slot| slot.0 % 3 == 0);
+            let residual = Residual::new(&func, &start, &pool, |slot| slot.0 % 3 == 0);
             invariant += func.ops.len() - residual.rest.len();
         }
         assert!(invariant > 2000, "{invariant}");

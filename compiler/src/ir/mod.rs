@@ -357,6 +357,11 @@ impl Func {
         self.ops[value.index()]
     }
 
+    /// Whether elementary functions are still to be expanded.
+    pub fn has_elementary_functions(&self) -> bool {
+        self.ops.iter().any(|op| matches!(op, Op::Unary(..) | Op::Binary(..)))
+    }
+
     /// The values that must be available to compute an operation, see [`reads`].
     pub fn reads(&self, op: Op) -> impl Iterator<Item = Value> + use<> {
         reads(&self.ops, op)

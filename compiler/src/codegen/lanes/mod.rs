@@ -32,7 +32,7 @@ use crate::codegen::loop_plan::{LoopPlan, plan};
 use crate::ir::cfg::Rows;
 use crate::ir::hash::HashMap;
 use crate::ir::verify::{Stage, verify};
-use crate::ir::{Func, Op, Unary};
+use crate::ir::{Func, Unary};
 use crate::math;
 use abi::lanes::{FollowLanes, FollowLanesEntry, Lanes, LanesEntry};
 use abi::{Layout, Slot};
@@ -235,8 +235,8 @@ pub fn bytes(
     };
     // Expanded functions read the tables with which the pool of every model begins. A step without elementary functions
     // works with any pool.
-    let elementary = func.ops.iter().any(|op| matches!(op, Op::Unary(..) | Op::Binary(..)));
-    let expanded = elementary.then(|| math::expand_for_lanes(func, own));
+    let elementary = func.has_elementary_functions();
+    let expanded = elementary.then(|| math::expand_short(func, own));
     let func = expanded.as_ref().unwrap_or(func);
     match width.vectors_of_x64() {
         Some(own) => {
