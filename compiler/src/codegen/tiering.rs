@@ -218,10 +218,12 @@ impl Policy {
     /// Compiles when the runs so far have lost about as much as compiling takes: interpreting an operation takes some 2
     /// ns, and 1 ns in groups; compiling it some 2 µs. Compiling an adaptive step takes some 12 ms, because the time of
     /// register allocation grows faster than the length; an attempt takes 1.3 µs in groups and 0.3 µs in machine code. It
-    /// begins before that is lost, because it most often has a processor of its own.
+    /// begins before that is lost, because it most often has a processor of its own. Outputs are few operations for each
+    /// point of a run; compiling even the shortest function takes a millisecond in a new process.
     pub const USUAL: Policy = {
         let mut compiled_after = [Some(800); Function::ALL.len()];
         compiled_after[Function::Rosenbrock as usize] = Some(8_000);
+        compiled_after[Function::Outputs as usize] = Some(8_000);
         Policy { compiled_after, runs_between_looks: 64, in_background: true }
     };
 }

@@ -76,7 +76,10 @@ pub fn run_each<B: AsMut<[f64]> + AsRef<[f64]>>(func: &Func, blocks: &mut [B], p
         let bits = |block: &B| block.as_ref()[slot.index()].to_bits();
         others.iter().any(|other| bits(other) != bits(first))
     };
-    let mut residual = Residual::new(func, first.as_ref(), pool, differs);
+    // What is evaluated once anyway need not be found.
+    let is_single = times == 1 && others.len() < AT_ONCE;
+    let mut residual =
+        if is_single { Residual::whole(func) } else { Residual::new(func, first.as_ref(), pool, differs) };
     for some in blocks.chunks_mut(AT_ONCE) {
         let mut some: Vec<&mut [f64]> = some.iter_mut().map(AsMut::as_mut).collect();
         for _ in 0..times {
@@ -110,6 +113,11 @@ impl<'f> Residual<'f> {
         let mut values = vec![[0; AT_ONCE]; func.ops.len()];
         operations(func, once.into_iter(), &[block], pool, &mut values);
         Residual { func, rest, values }
+    }
+
+    /// Without invariants.
+    fn whole(func: &'f Func) -> Residual<'f> {
+        Residual { func, rest: (0..func.ops.len()).collect(), values: vec![[0; AT_ONCE]; func.ops.len()] }
     }
 
     /// Runs the function once on each block: at most [`AT_ONCE`].
