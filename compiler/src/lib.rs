@@ -67,7 +67,8 @@ pub struct Case {
 /// Compiles an experiment of a loaded text. Returns one case for each combination of its sweeps. Calls `on_stage` with
 /// the name of each stage when the stage begins.
 ///
-/// # Errors All errors of the experiment and of the models it runs.
+/// # Errors
+/// All errors of the experiment and of the models it runs.
 pub fn compile(
     loaded: &mut Loaded,
     sources: &dyn Sources,
@@ -86,7 +87,8 @@ pub fn compile(
 /// Compiles an experiment once for many runs that differ in the values of the parameters in `options.changes.vary`.
 /// Returns one entry for each combination of the experiment's own sweeps.
 ///
-/// # Errors All errors of the experiment and of the models it runs.
+/// # Errors
+/// All errors of the experiment and of the models it runs.
 pub fn varying(
     loaded: &mut Loaded,
     sources: &dyn Sources,
@@ -111,7 +113,8 @@ pub fn varying(
 /// Compiles a fit: its experiments for many runs that differ in the values of its unknowns; once for each combination of
 /// its sweeps.
 ///
-/// # Errors All errors of the fit and of the models it runs.
+/// # Errors
+/// All errors of the fit and of the models it runs.
 pub fn fit(
     loaded: &mut Loaded,
     sources: &dyn Sources,
@@ -153,7 +156,8 @@ fn fitted(loaded: &Loaded, read: fit::Read, options: &Options) -> Result<fit::Fi
 /// named. Parameters that determine what is compiled, such as a number of parts, keep their values: they are not among
 /// [`experiment::vary::Varying::params`].
 ///
-/// # Errors All errors of the experiment and of the models it runs; an experiment that runs a rig (E0905).
+/// # Errors
+/// All errors of the experiment and of the models it runs; an experiment that runs a rig (E0905).
 pub fn adjustable(
     loaded: &mut Loaded,
     sources: &dyn Sources,
@@ -230,7 +234,8 @@ pub struct Built {
 /// Compiles a model on its own with its inputs open, or the first combination of an experiment's sweeps. A model with
 /// delays can be stepped only with `changes.step`, because the length of the kept history depends on the step.
 ///
-/// # Errors All errors of the model or experiment.
+/// # Errors
+/// All errors of the model or experiment.
 pub fn build(
     loaded: &mut Loaded,
     sources: &dyn Sources,
@@ -261,7 +266,8 @@ pub fn build(
 
 /// A model, or the first combination of an experiment's sweeps, as Python source: see [`codegen::python`].
 ///
-/// # Errors All errors of the model or experiment; E0911 for each statement that is no function of the present.
+/// # Errors
+/// All errors of the model or experiment; E0911 for each statement that is no function of the present.
 pub fn python(
     loaded: &mut Loaded,
     sources: &dyn Sources,
@@ -298,7 +304,8 @@ pub fn python(
 /// Prepares a model or an experiment for linearisation; `name` is the name of either. Takes the first combination of an
 /// experiment's sweeps.
 ///
-/// # Errors All errors of the model or experiment.
+/// # Errors
+/// All errors of the model or experiment.
 pub fn linear(
     loaded: &mut Loaded,
     sources: &dyn Sources,
@@ -441,7 +448,8 @@ impl CompiledRig {
 
 /// Compiles a rig of a loaded text. Only `set` of the changes in `options` has an effect.
 ///
-/// # Errors All errors of the rig and of the models it runs.
+/// # Errors
+/// All errors of the rig and of the models it runs.
 pub fn rig(
     loaded: &mut Loaded,
     sources: &dyn Sources,
@@ -644,7 +652,8 @@ pub fn dissipation(
 
 /// Explains a model of the root file on its own.
 ///
-/// # Errors All errors of the model.
+/// # Errors
+/// All errors of the model.
 pub fn explain(
     loaded: &Loaded,
     sources: &dyn Sources,
@@ -659,7 +668,8 @@ pub fn explain(
 
 /// Explains a model of the root file on its own, with changes of its parameters and parts.
 ///
-/// # Errors All errors of the model and of the changes.
+/// # Errors
+/// All errors of the model and of the changes.
 pub fn explain_changed(
     loaded: &mut Loaded,
     sources: &dyn Sources,
@@ -683,7 +693,8 @@ pub fn explain_changed(
 
 /// Explains a model of any loaded file on its own.
 ///
-/// # Errors All errors of the model, or that there is no such model.
+/// # Errors
+/// All errors of the model, or that there is no such model.
 pub fn explain_in(
     loaded: &Loaded,
     sources: &dyn Sources,
@@ -711,7 +722,8 @@ pub fn explain_in(
 
 /// Compiles a model of the text on its own, ready for fixed steps of `step` s, at its start with its inputs at 0.
 ///
-/// # Errors All errors of the model, or the reason why there is no machine code.
+/// # Errors
+/// All errors of the model, or the reason why there is no machine code.
 pub fn stepping(
     loaded: &Loaded,
     sources: &dyn Sources,
@@ -739,7 +751,8 @@ pub fn stepping(
 
 /// Lists every quantity of an experiment's system, with these changes.
 ///
-/// # Errors All errors of the experiment.
+/// # Errors
+/// All errors of the experiment.
 pub fn quantities(
     loaded: &mut Loaded,
     sources: &dyn Sources,
@@ -753,7 +766,8 @@ pub fn quantities(
 
 /// Explains an experiment's system, with these changes.
 ///
-/// # Errors All errors of the experiment.
+/// # Errors
+/// All errors of the experiment.
 pub fn explain_run(
     loaded: &mut Loaded,
     sources: &dyn Sources,
@@ -770,7 +784,8 @@ pub fn explain_run(
 
 /// Explains the control program of a rig.
 ///
-/// # Errors All errors of the rig, except that its steps are unstable.
+/// # Errors
+/// All errors of the rig, except that its steps are unstable.
 pub fn explain_rig(
     loaded: &mut Loaded,
     sources: &dyn Sources,

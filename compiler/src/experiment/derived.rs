@@ -316,7 +316,8 @@ impl Deriving<'_> {
 
 /// The interval of rows in s that are equidistant but for gaps, for a filter at this place.
 ///
-/// # Errors E0908.
+/// # Errors
+/// E0908.
 pub fn equidistant(times: &[f64], steady: bool, span: Span) -> Result<f64, Diagnostic> {
     if steady || times.len() < 2 {
         let message = "a filter needs rows over time";

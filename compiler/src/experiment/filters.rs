@@ -172,7 +172,8 @@ pub struct Uneven {
 
 /// The interval in s of rows that are equidistant but for gaps; at least two.
 ///
-/// # Errors Where they are not.
+/// # Errors
+/// Where they are not.
 pub fn interval(times: &[f64]) -> Result<f64, Uneven> {
     assert!(times.len() > 1, "{} rows have no interval", times.len());
     let mut all: Vec<f64> = times.windows(2).map(|pair| pair[1] - pair[0]).collect();

@@ -194,7 +194,8 @@ impl<'a> Change<'a> {
 
 /// Reads and lowers an experiment.
 ///
-/// # Errors All errors; at least one.
+/// # Errors
+/// All errors; at least one.
 pub fn read(
     loaded: &mut Loaded,
     sources: &dyn Sources,

@@ -38,7 +38,8 @@ pub(super) fn grids(loaded: &Loaded, parts: &Statements, diagnostics: &mut Vec<D
 
 /// The numbers of a grid in the unit of its first value, and that unit.
 ///
-/// # Errors What is wrong with it, and how to write it.
+/// # Errors
+/// What is wrong with it, and how to write it.
 type Grid = Result<(Vec<f64>, Option<ast::UnitText>), (&'static str, &'static str)>;
 
 fn grid(first: &Expr, last: &Expr, spacing: &Spacing) -> Grid {

@@ -236,7 +236,8 @@ impl Varying {
 
     /// An instance and a plan for these values in SI units.
     ///
-    /// # Errors The violated condition, in words.
+    /// # Errors
+    /// The violated condition, in words.
     pub fn at(&self, values: &[(Slot, f64)]) -> Result<PreparedRun, String> {
         let mut instance = Instance::new(self.description.clone(), self.code.clone(), &self.params);
         if let Some(adaptive) = &self.adaptive {

@@ -192,7 +192,8 @@ const MOST_ALTERNATIVES: usize = 64;
 /// Reads a fit: the experiments that it runs with its unknowns variable, and what it asks; once for each combination of
 /// its sweeps.
 ///
-/// # Errors All errors of the fit and of the models it runs.
+/// # Errors
+/// All errors of the fit and of the models it runs.
 pub fn read(
     loaded: &mut Loaded,
     sources: &dyn Sources,

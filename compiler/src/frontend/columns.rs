@@ -71,7 +71,8 @@ fn too_few(line: &str, has: usize, needed: usize) -> Fault {
 
 /// Reads the wanted columns of a text.
 ///
-/// # Errors The first error.
+/// # Errors
+/// The first error.
 pub fn read(text: &str, wanted: &[Selector]) -> Result<Columns, Fault> {
     let mut out = Columns { numbers: vec![Vec::new(); wanted.len()], units: vec![None; wanted.len()], places: vec![] };
     let mut separator = None;
@@ -172,7 +173,8 @@ fn by_place(wanted: &[Selector]) -> Vec<Option<usize>> {
 /// By heading, if a column says its heading or if the headings have all names; else by place. A name that the headings
 /// have at another place than the text is an error: by place it would be read from another column.
 ///
-/// # Errors Why not. `line`: of the headings.
+/// # Errors
+/// Why not. `line`: of the headings.
 fn found(headings: &[Heading], wanted: &[Selector], line: &str) -> Result<Vec<Option<usize>>, Fault> {
     let at = |name: &str| -> Vec<usize> {
         let exact = |heading: &Heading| heading.cell == name;

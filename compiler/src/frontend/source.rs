@@ -24,7 +24,8 @@ pub trait Sources {
 
     /// Reads a file named in the text called `from`. Returns the file's name and its text.
     ///
-    /// # Errors The reason why it cannot be read, as a sentence fragment: `no such file`.
+    /// # Errors
+    /// The reason why it cannot be read, as a sentence fragment: `no such file`.
     fn file(&self, from: &str, path: &str) -> Result<(String, String), String>;
 }
 

@@ -60,7 +60,8 @@ pub struct Signal {
 
 /// Reads the DBC file with this id.
 ///
-/// # Errors The error and its span.
+/// # Errors
+/// The error and its span.
 pub fn read(file: FileId, text: &str) -> Result<Vec<Message>, (String, Span)> {
     let dbc = Dbc::try_from(text).map_err(|error| {
         // The first line of the parser's message says what it expected; the position follows as `--> LINE:COLUMN`.
@@ -143,7 +144,8 @@ pub fn read(file: FileId, text: &str) -> Result<Vec<Message>, (String, Span)> {
 
 /// For each multiplexed signal, its switch and the raw value of the switch at which it is present.
 ///
-/// # Errors The signal whose switch is undetermined or unsupported, and the reason.
+/// # Errors
+/// The signal whose switch is undetermined or unsupported, and the reason.
 #[allow(clippy::type_complexity, reason = "a signal, its switch and the value of that")]
 fn switched(dbc: &Dbc, message: &can_dbc::Message) -> Result<Vec<(usize, (usize, u64))>, (usize, String)> {
     let signals = &message.signals;

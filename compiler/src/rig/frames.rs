@@ -162,7 +162,8 @@ pub fn by_dbc(
 
 /// The messages of a DBC file that can be read, for callers that decode frames.
 ///
-/// # Errors The error in the file, in words.
+/// # Errors
+/// The error in the file, in words.
 pub fn of_dbc(text: &str) -> Result<Vec<Message>, String> {
     let mut messages = dbc::read(FileId(0), text).map_err(|(why, span)| {
         let line = text[..span.start as usize].lines().count().max(1);

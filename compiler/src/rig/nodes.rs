@@ -98,7 +98,8 @@ impl Description {
 
     /// Unit, identity and span of a signal that can be commanded.
     ///
-    /// # Errors The names of all signals that can be commanded.
+    /// # Errors
+    /// The names of all signals that can be commanded.
     pub fn sends(&self, name: &str) -> Result<(Option<Unit>, SignalRef, Span), Vec<String>> {
         match &self.protocol {
             Protocol::Cia402 { mode, .. } => {

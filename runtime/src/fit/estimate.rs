@@ -256,7 +256,8 @@ const NO_NOISE: f64 = 1e-3;
 
 /// Finds the values that fit best, from the start.
 ///
-/// # Errors Why there is no answer.
+/// # Errors
+/// Why there is no answer.
 pub fn fit(question: Question) -> Result<Answer, Trouble> {
     let Question { unknowns, items, minima, run, finer, with, level, limits, starts, seed, estimator, robust, journal } =
         question;
@@ -577,7 +578,8 @@ impl<'a> Search<'a> {
 
     /// The starts that can be run: the written one, then the others by their misfit; and the number of their residuals.
     ///
-    /// # Errors The commonest cause, if none can be run.
+    /// # Errors
+    /// The commonest cause, if none can be run.
     fn judge(&mut self, items: &[Item], starts: &[Vec<f64>]) -> Result<(Vec<Vec<f64>>, usize), String> {
         let (mut misfits, mut rows) = (Vec::new(), 0);
         for first in (0..starts.len()).step_by(JUDGED_AT_ONCE) {

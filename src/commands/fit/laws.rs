@@ -73,7 +73,8 @@ struct Extent {
 
 /// A text with a fit for each law. `recording`: the recording as CSV; `file`: how the text names it.
 ///
-/// # Errors What the recording lacks, in words.
+/// # Errors
+/// What the recording lacks, in words.
 pub fn text(recording: &str, file: &str) -> Result<String, String> {
     let heading = recording.lines().find(|line| !line.trim().is_empty() && !line.trim_start().starts_with('#'));
     let heading = heading.ok_or("it is empty")?;
