@@ -5,7 +5,7 @@
 //!
 //! Mutants tried by hand, each fails: an `#[ignore]`, a fourth type of one name, a fifth loose file in the compiler's
 //! root, a heading without kind, the host of a registry in a page, a branch on the wording of a message, a test that
-//! returns early.
+//! returns early, words after `# Errors` on its line.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -32,7 +32,7 @@ impl Outcome {
 /// What a rule says, and its check.
 type Rule = (&'static str, fn() -> Outcome);
 
-const RULES: [Rule; 8] = [
+const RULES: [Rule; 9] = [
     ("the changelog has its headings by kind", changelog),
     ("commits are named by what they do", commits),
     ("no test is ignored", ignored),
@@ -41,6 +41,7 @@ const RULES: [Rule; 8] = [
     ("a type's name is used at most three times in a crate", type_names),
     ("the root of the compiler has at most four loose files", compiler_root),
     ("no host of a package registry is named", registries),
+    ("a heading of a docstring stands on a line of its own", headings),
 ];
 
 fn main() -> ExitCode {
@@ -416,4 +417,22 @@ fn registries() -> Outcome {
         }
     }
     Outcome::of(broken, format!("{all} files"))
+}
+
+fn headings() -> Outcome {
+    let (mut broken, mut all) = (Vec::new(), 0);
+    for path in files(&["."], ".rs") {
+        for (number, line) in fs::read_to_string(&path).expect("a source").lines().enumerate() {
+            let comment = line.trim_start();
+            let Some(words) = comment.strip_prefix("/// # ").or_else(|| comment.strip_prefix("//! # ")) else {
+                continue;
+            };
+            all += 1;
+            let begins = |heading: &str| words.strip_prefix(heading).is_some_and(|more| more.starts_with(' '));
+            if ["Errors", "Panics", "Safety"].into_iter().any(begins) {
+                broken.push(format!("{}:{}: {comment}", shown(&path), number + 1));
+            }
+        }
+    }
+    Outcome::of(broken, format!("{all} headings"))
 }
