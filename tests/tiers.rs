@@ -47,7 +47,7 @@ fn code(variant: &Variant, policy: Option<Policy>) -> Code {
     }
 }
 
-/// The final block, what was measured, how the run ended, and what it recorded.
+/// Runs an experiment. Returns the bits of the final block, the verdicts or why it failed, and the recording.
 fn run(variant: &Variant, policy: Option<Policy>) -> (Vec<u64>, String, Recording) {
     let (program, code) = (&variant.program, code(variant, policy));
     let instance = Instance::new(Arc::new(program.description.clone()), code, &program.params);

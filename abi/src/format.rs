@@ -218,23 +218,23 @@ mod tests {
         assert_eq!(plain(1e-5), "1e-5");
     }
 
-    /// The library that finds the digits changes neither their number nor where exponents begin. It rounds to the even digit
-    /// where two decimals of that length are equally near. A mutant with the limits of the library fails.
+    /// The digits come from another library. It must change neither their number nor where exponents begin; where two
+    /// decimals of that length are equally near, it takes the even one. A mutant with its limits for exponents fails.
     #[test]
     fn plain_numbers_have_the_form_of_the_standard_library() {
-        let mut state = 1_u64;
+        let mut state = 1;
         for case in 0..400_000 {
-            state = state.wrapping_mul(6364136223846793005).wrapping_add(1442695040888963407);
+            let bits = crate::random::next(&mut state);
             // All bits, or numbers of usual size with few digits.
             let value = match case % 2 {
-                0 => f64::from_bits(state),
-                _ => format!("{}e{}", (state >> 44) as i64 - 500_000, (state % 29) as i32 - 20).parse().unwrap(),
+                0 => f64::from_bits(bits),
+                _ => format!("{}e{}", (bits >> 44) as i64 - 500_000, (bits % 29) as i32 - 20).parse().unwrap(),
             };
             let is_short = value == 0.0 || !value.is_finite() || (1e-4..1e15).contains(&value.abs());
             let (found, expected) = (plain(value), if is_short { value.to_string() } else { format!("{value:e}") });
-            let is_equally_near = found.len() == expected.len();
+            let is_as_long = found.len() == expected.len();
             let reads_back = found.parse::<f64>().is_ok_and(|read| read == value);
-            assert!(found == expected || is_equally_near && reads_back, "case {case}: {found}, not {expected}");
+            assert!(found == expected || is_as_long && reads_back, "case {case}: {found}, not {expected}");
         }
     }
 

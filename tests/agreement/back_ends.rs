@@ -45,8 +45,8 @@ pub fn compare(cases: &[Case], level: &str) -> Vec<Agreed> {
     expected.into_iter().zip(agreed).map(|(results, lanes)| Agreed { results, lanes }).collect()
 }
 
-/// Back ends in this process: groups, lanes, machine code in memory, an image. Returns the widths of lanes that took part in
-/// each case.
+/// Back ends in this process: groups, lanes, machine code in memory, an image. Returns the widths of lanes that took
+/// part in each case.
 fn on_this_processor(cases: &[Case], expected: &[Vec<Result>]) -> Vec<Vec<&'static str>> {
     let widths: Vec<Width> = Width::ALL.into_iter().filter(|width| width.is_here()).collect();
     let here = Target::here().expect("tests run where code is made for");

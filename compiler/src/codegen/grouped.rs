@@ -6,13 +6,14 @@
 //! with LuGre friction has 1,050 operations in 350 groups. Grouping takes as long as some 50 runs in order, and a
 //! hundredth of what compiling takes.
 //!
-//! In: a function whose exponentials may not be expanded, because a single operation computes one faster than 30. Out: a
-//! form that runs with the bits of [`ir::interpret`](crate::ir::interpret).
+//! In: a function before its elementary functions are expanded. Exponentials stay single operations, which compute them
+//! faster than some 30 operations of their expansion would. Out: a form that runs with the bits of [`ir::interpret`](crate::ir::interpret).
 //!
 //! Source: list scheduling by the longest path (Cooper, Torczon, *Engineering a Compiler*, 2012, sec. 12.3).
 
 use crate::ir::eval::{Operands, apply};
 use crate::ir::hash::HashMap;
+use crate::ir::interpret::{results, until_status};
 use crate::ir::variance::variance;
 use crate::ir::verify::{Stage, verify};
 use crate::ir::{Func, Op, Unary, Value};
@@ -66,8 +67,7 @@ impl Grouped {
     /// `is_invariant`: whether the operation with this index is evaluated only in [`begin`](Grouped::begin). Its operands
     /// must be too.
     fn of(func: &Func, is_invariant: impl Fn(usize) -> bool) -> Grouped {
-        let mut places = Places::of_constants(func);
-        let constants = std::mem::take(&mut places.constants);
+        let (mut places, constants) = Places::of_constants(func);
         let once = places.group(func, &is_invariant);
         let each = places.group(func, |_| true);
         let place = |value: Value| Value(places.of(value));
@@ -109,38 +109,27 @@ impl Grouped {
 
     /// Runs the function that has begun.
     fn repeat(&self, block: &mut [f64], pool: &[f64], values: &mut [u64], count: u64) -> u64 {
-        /// The same with the instructions for fused products and for rounding to integers, which are calls otherwise
-        /// and then take most of the time.
+        /// Compiled with the processor's instructions for fused products and for rounding to integers. Without them each is
+        /// a call of a library, and these calls take most of the time.
         #[cfg(target_arch = "x86_64")]
         #[target_feature(enable = "fma,sse4.1")]
         fn with_fma(of: &Grouped, block: &mut [f64], pool: &[f64], values: &mut [u64], count: u64) -> u64 {
-            of.until_status(block, pool, values, count)
+            until_status(count, || of.run(block, pool, values))
         }
         #[cfg(target_arch = "x86_64")]
         if is_x86_feature_detected!("fma") && is_x86_feature_detected!("sse4.1") {
             // SAFETY: the processor has just been asked for both.
             return unsafe { with_fma(self, block, pool, values, count) };
         }
-        self.until_status(block, pool, values, count)
+        until_status(count, || self.run(block, pool, values))
     }
 
+    /// Runs it once and returns its status.
     #[inline(always)]
-    fn until_status(&self, block: &mut [f64], pool: &[f64], values: &mut [u64], count: u64) -> u64 {
-        for _ in 0..count {
-            self.each.run(block, pool, values);
-            for (slot, place) in &self.ends.stores {
-                block[slot.index()] = f64::from_bits(values[place.index()]);
-            }
-            for write in &self.ends.writes {
-                let index = values[write.index.index()].min(u64::from(write.len) - 1);
-                block[write.base.index() + index as usize] = f64::from_bits(values[write.value.index()]);
-            }
-            let status = self.ends.status.map_or(0, |place| values[place.index()]);
-            if status != 0 {
-                return status;
-            }
-        }
-        0
+    fn run(&self, block: &mut [f64], pool: &[f64], values: &mut [u64]) -> u64 {
+        self.each.run(block, pool, values);
+        results(&self.ends, &mut [block], values.as_chunks::<1>().0);
+        self.ends.status.map_or(0, |place| values[place.index()])
     }
 }
 
@@ -198,7 +187,7 @@ struct Group<'a> {
 }
 
 impl Group<'_> {
-    /// `result`: from what an operation reads, and the values so far.
+    /// Computes the group. `result` gets what an operation reads, as in [`Groups::operands`], and the values known so far.
     #[inline(always)]
     fn each(&mut self, result: impl Fn([u32; 3], Known) -> u64) {
         for (k, operands) in self.operands.iter().enumerate() {
@@ -242,12 +231,12 @@ struct Places {
     of_ops: Vec<u32>,
     /// For each operation the one whose bits it has: conversions between a real and its bits change nothing.
     same_as: Vec<u32>,
-    constants: Vec<u64>,
     next: usize,
 }
 
 impl Places {
-    fn of_constants(func: &Func) -> Places {
+    /// Gives places to the constants; returns their bits too.
+    fn of_constants(func: &Func) -> (Places, Vec<u64>) {
         let (mut of_ops, mut same_as) = (vec![NOWHERE; func.ops.len()], Vec::with_capacity(func.ops.len()));
         let mut constants = Vec::new();
         for (i, op) in func.ops.iter().enumerate() {
@@ -267,7 +256,7 @@ impl Places {
             });
         }
         let next = constants.len();
-        Places { of_ops, same_as, constants, next }
+        (Places { of_ops, same_as, next }, constants)
     }
 
     /// The operation that computes the bits of a value.

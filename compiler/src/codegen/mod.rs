@@ -7,7 +7,7 @@
 //!
 //! ```text
 //! tiering             interprets a function first; calls grouped and jit once it has run often enough
-//! grouped             an interpreter whose order of operations the processor predicts
+//! grouped             interprets operations of one kind together, for runs that end before machine code pays
 //! jit, image → target one function after the other: passes → emit → Cranelift
 //!   passes            the list of all passes over control-flow graphs, in order
 //! lanes               isel → schedule → regalloc → assembler, or emit_f64x2 → Cranelift

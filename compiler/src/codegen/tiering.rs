@@ -154,9 +154,17 @@ pub fn code(functions: &[(Function, Func)], description: &Description, interpret
     if interpret {
         return (interpreted(), Vec::new());
     }
-    match jit::compile_prepared(functions, layout, pool) {
-        Ok((machine, _)) => (Code::Machine(machine), Vec::new()),
-        Err(why) => (interpreted(), vec![format!("runs interpreted, some twenty times slower: {why}")]),
+    match machine_code(functions, description) {
+        Ok(code) => (code, Vec::new()),
+        Err(note) => (interpreted(), vec![note]),
+    }
+}
+
+/// Machine code of functions, or a note for the user that they run interpreted, and why.
+fn machine_code(functions: &[(Function, Func)], description: &Description) -> Result<Code, String> {
+    match jit::compile_prepared(functions, &description.layout, description.pool.len()) {
+        Ok((machine, _)) => Ok(Code::Machine(machine)),
+        Err(why) => Err(format!("runs interpreted, some twenty times slower: {why}")),
     }
 }
 
@@ -166,14 +174,17 @@ pub fn code(functions: &[(Function, Func)], description: &Description, interpret
 /// compiled, no run waits for code, and functions that run once, such as the start, are never compiled. With `interpret`
 /// it is the reference, operation by operation.
 pub fn late(program: &Program, method: Method, interpret: bool) -> (Code, Vec<String>) {
+    if interpret {
+        return code(&functions(program, method), &program.description, true);
+    }
     let size = program.derivatives.ops.len() + program.outputs.ops.len() + program.start.ops.len();
-    if !interpret && size <= MAX_TIERED_OPS && target::here().is_ok() {
+    if size <= MAX_TIERED_OPS && target::here().is_ok() {
         return (on_demand(program, method, false), Vec::new());
     }
     // A program that may be too large for machine code is compiled at once, so that the note about it comes at once.
-    match code(&functions(program, method), &program.description, interpret) {
-        (Code::Interpreted(_), notes) if !interpret => (on_demand(program, method, true), notes),
-        code => code,
+    match machine_code(&functions(program, method), &program.description) {
+        Ok(code) => (code, Vec::new()),
+        Err(note) => (on_demand(program, method, true), vec![note]),
     }
 }
 

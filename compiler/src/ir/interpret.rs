@@ -163,7 +163,7 @@ fn repeat(func: &Func, block: &mut [f64], pool: &[f64], values: &mut [u64], coun
 
 /// Runs up to `count` times; returns the first status that is not 0, or 0.
 #[inline(always)]
-fn until_status(count: u64, mut run: impl FnMut() -> u64) -> u64 {
+pub(crate) fn until_status(count: u64, mut run: impl FnMut() -> u64) -> u64 {
     for _ in 0..count {
         let status = run();
         if status != 0 {
@@ -206,9 +206,9 @@ fn operations<const N: usize>(
     }
 }
 
-/// Stores the results of a function.
+/// Stores what a function stores and writes. `values`: by the numbers that its stores and writes name.
 #[inline(always)]
-fn results<const N: usize>(func: &Func, blocks: &mut [&mut [f64]], values: &[[u64; N]]) {
+pub(crate) fn results<const N: usize>(func: &Func, blocks: &mut [&mut [f64]], values: &[[u64; N]]) {
     for (lane, block) in blocks.iter_mut().enumerate() {
         for (slot, value) in &func.stores {
             block[slot.index()] = f64::from_bits(values[value.index()][lane]);

@@ -99,7 +99,7 @@ impl Description {
     /// Unit, identity and span of a signal that can be commanded.
     ///
     /// # Errors
-    /// The names of all signals that can be commanded.
+    /// The names of all signals that can be commanded, if this is none of them.
     pub fn sends(&self, name: &str) -> Result<(Option<Unit>, SignalRef, Span), Vec<String>> {
         match &self.protocol {
             Protocol::Cia402 { mode, .. } => {
