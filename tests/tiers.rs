@@ -77,15 +77,17 @@ fn bits(x: &f64) -> u64 {
 
 /// Functions that are compiled after a random number of runs, most often within the run.
 fn policy(random: &mut Random) -> Policy {
-    let compiled_after = Function::ALL.map(|_| match random.below(4) {
-        // Interpreted, in groups from some number of runs on.
-        0 => None,
-        1 => Some(random.below(4) as u64),
-        2 => Some(random.below(100) as u64),
-        _ => Some(random.below(1000) as u64),
-    });
+    let mut thresholds = || {
+        Function::ALL.map(|_| match random.below(4) {
+            0 => None,
+            1 => Some(random.below(4) as u64),
+            2 => Some(random.below(100) as u64),
+            _ => Some(random.below(1000) as u64),
+        })
+    };
+    let (baseline_after, compiled_after) = (thresholds(), thresholds());
     let runs_between_looks = 1 + random.below(8) as u64;
-    Policy { compiled_after, runs_between_looks, in_background: random.below(2) == 0 }
+    Policy { baseline_after, compiled_after, runs_between_looks, in_background: random.below(2) == 0 }
 }
 
 /// A seed's experiment of the library, or a random text: name, text, experiment.

@@ -30,6 +30,12 @@ compiled! {
     );
 }
 
+compiled! {
+    /// Machine code that runs a function once, for a single instance, and returns its status. `scratch`: space for as many
+    /// numbers as the code needs.
+    pub type BaselineEntry = fn(block: *mut f64, pool: *const f64, scratch: *mut u64);
+}
+
 /// Code of a step in a loop over rows, for many instances at once.
 #[derive(Clone)]
 pub struct FollowLanes {

@@ -93,7 +93,7 @@ fn stepping(program: &Program, method: Method, interpret: bool) -> Code {
     let len = program.derivatives.ops.len() + program.outputs.ops.len();
     match interpret || compiler::codegen::target::here().is_err() || len > MOST_AT_ONCE {
         true => tiering::on_demand(program, method, interpret),
-        false => tiering::tiered(program, method, Policy { in_background: false, ..Policy::USUAL }),
+        false => tiering::tiered(program, method, Policy { in_background: false, ..Policy::usual() }),
     }
 }
 

@@ -6,13 +6,12 @@ use abi::image::Target;
 use abi::lanes::Batch;
 use abi::table::{Code, Function, Interpret};
 use abi::{Description, Slot};
-use compiler::codegen::grouped::Grouped;
+use compiler::codegen::lanes::baseline::{self, Baseline};
 use compiler::codegen::lanes::{self, Width};
 use compiler::codegen::{c, image, jit};
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
-use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 /// The common result of all back ends.
@@ -45,14 +44,17 @@ pub fn compare(cases: &[Case], level: &str) -> Vec<Agreed> {
     expected.into_iter().zip(agreed).map(|(results, lanes)| Agreed { results, lanes }).collect()
 }
 
-/// Back ends in this process: groups, lanes, machine code in memory, an image. Returns the widths of lanes that took
+/// Back ends in this process: baseline code, lanes, machine code in memory, an image. Returns the widths of lanes that took
 /// part in each case.
 fn on_this_processor(cases: &[Case], expected: &[Vec<Result>]) -> Vec<Vec<&'static str>> {
     let widths: Vec<Width> = Width::ALL.into_iter().filter(|width| width.is_here()).collect();
     let here = Target::here().expect("tests run where code is made for");
     let one = |(case, expected): (&Case, &Vec<Result>)| {
-        let code = Code::Interpreted(Arc::new(InGroups::of(case)));
-        agree(case, expected, &case.on(&code), "an interpreter of groups");
+        if Baseline::is_here() {
+            let code = baseline::code(&case.functions, case.layout(), case.description.pool.len());
+            let code = code.unwrap_or_else(|why| panic!("{}: {why}", case.name));
+            agree(case, expected, &case.on(&code), "baseline code");
+        }
         let machine = jit::compile_prepared(&case.functions, case.layout(), case.description.pool.len());
         let code = Code::Machine(machine.unwrap_or_else(|why| panic!("{}: {why}", case.name)).0);
         agree(case, expected, &case.on(&code), "machine code in memory");
@@ -70,27 +72,6 @@ fn on_this_processor(cases: &[Case], expected: &[Vec<Result>]) -> Vec<Vec<&'stat
         widths.iter().filter(took_part).map(|width| width.name()).collect()
     };
     cases.iter().zip(expected).map(one).collect()
-}
-
-/// The functions of a case, interpreted in groups.
-struct InGroups(Vec<(Function, Grouped)>);
-
-impl InGroups {
-    fn of(case: &Case) -> InGroups {
-        let grouped = |func| Grouped::new(func, case.layout(), case.description.pool.len());
-        InGroups(case.functions.iter().map(|(function, func)| (*function, grouped(func))).collect())
-    }
-}
-
-impl Interpret for InGroups {
-    fn call(&self, function: Function, block: &mut [f64], pool: &[f64], count: u64) -> u64 {
-        let (_, grouped) = self.0.iter().find(|(one, _)| *one == function).expect("the case has the function");
-        grouped.call(block, pool, count)
-    }
-
-    fn has(&self, function: Function) -> bool {
-        self.0.iter().any(|(one, _)| *one == function)
-    }
 }
 
 /// Compares the results of a case with those of the interpreter.

@@ -11,7 +11,7 @@
 //! machine.
 
 use crate::analysis::memo::Memo;
-use crate::codegen::grouped::run_while;
+use crate::codegen::lanes::baseline::Repeated;
 use crate::ir::Func;
 use crate::ir::build::{Build, Env};
 use crate::ir::expr::Shared;
@@ -138,7 +138,7 @@ pub struct Bench<'a> {
     /// The start blocks after fast states have relaxed.
     rest: OnceCell<Vec<Vec<f64>>>,
     /// Steps of a program without delays, by method.
-    steps: RefCell<HashMap<u8, Rc<Func>>>,
+    steps: RefCell<HashMap<u8, Rc<Repeated>>>,
     /// [`SHORT`] and [`SLOW`], for which tests have others.
     short: Option<(f64, usize)>,
     slow: f64,
@@ -721,8 +721,8 @@ impl<'a> Bench<'a> {
     }
 
     /// The step of a method with all ticks and transitions, expanded, for a program without delays.
-    fn step(&self, method: Method) -> Rc<Func> {
-        let make = || Rc::new(expand(&fixed_step::step(self.program, method)));
+    fn step(&self, method: Method) -> Rc<Repeated> {
+        let make = || Rc::new(Repeated::new(expand(&fixed_step::step(self.program, method))));
         self.steps.borrow_mut().entry(method as u8).or_insert_with(make).clone()
     }
 
@@ -757,18 +757,23 @@ impl<'a> Bench<'a> {
         at[Slot::STEP.index()] = h;
         let (start, step) = match program {
             Cow::Borrowed(_) => (Cow::Borrowed(&self.code.start), self.step(method)),
-            Cow::Owned(_) => (Cow::Owned(expand(&program.start)), Rc::new(expand(&fixed_step::step(&program, method)))),
+            Cow::Owned(_) => (
+                Cow::Owned(expand(&program.start)),
+                Rc::new(Repeated::new(expand(&fixed_step::step(&program, method)))),
+            ),
         };
         run_once(&start, &mut at, &program.description.pool);
         at[layout.states.range()].copy_from_slice(&block[self.program.description.layout.states.range()]);
         let first = at[layout.states.range()].to_vec();
         // Limit on the cost of a run.
-        let most = WORK / (2 * step.ops.len());
-        run_while(&step, &mut at, &program.description.pool, steps.min(most.max(RUN)), |at| {
+        let most = WORK / (2 * step.func().ops.len());
+        for _ in 0..steps.min(most.max(RUN)) {
+            step.run(layout, &mut at, &program.description.pool);
             let now = &at[layout.states.range()];
-            look(&first, now)?;
-            if now.iter().all(|x| x.is_finite()) { ControlFlow::Continue(()) } else { ControlFlow::Break(()) }
-        });
+            if look(&first, now).is_break() || !now.iter().all(|x| x.is_finite()) {
+                return;
+            }
+        }
     }
 
     /// A state whose rate jumps at a change of its sign and opposes it on both sides, so that fixed steps of this

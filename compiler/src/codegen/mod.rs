@@ -6,11 +6,11 @@
 //! `emit_f64x2`, `target`, `jit` and `executable_memory` know Cranelift.
 //!
 //! ```text
-//! tiering             interprets a function first; calls grouped and jit once it has run often enough
-//! grouped             interprets operations of one kind together, for runs that end before machine code pays
+//! tiering             interprets a function first; calls baseline and jit once it has run often enough
 //! jit, image → target one function after the other: passes → emit → Cranelift
 //!   passes            the list of all passes over control-flow graphs, in order
 //! lanes               isel → schedule → regalloc → assembler, or emit_f64x2 → Cranelift
+//!   baseline          the same for a single instance, soon made, for runs that end before optimised code exists
 //! c                   C source, directly from the expanded functions
 //! python              Python source of derivatives and outputs for other libraries, within rounding
 //! ```
@@ -41,7 +41,6 @@ pub mod jit;
 pub mod image;
 pub mod c;
 pub mod python;
-pub mod grouped;
 pub mod tiering;
 pub mod pass_report;
 pub mod elementary;

@@ -1,7 +1,6 @@
 //! The meaning of every operation, on bits: constant folding, the interpreter and every back end agree with it.
 
 use super::{Op, Value};
-use std::array::from_fn;
 
 /// Evaluates `op` on the bits of its operands, and returns the bits of the result. A real is IEEE 754 binary64, an
 /// integer is two's complement, true is 1 and false is 0. `None` for operations that read the block or the pool, and
@@ -16,92 +15,57 @@ pub fn evaluate(op: Op, bits: impl Fn(Value) -> u64) -> Option<u64> {
 /// The same for `N` blocks at once: an operand has its bits in each of them.
 #[inline(always)]
 pub fn evaluate_each<const N: usize>(op: Op, bits: impl Fn(Value) -> [u64; N]) -> Option<[u64; N]> {
-    match op {
-        Op::Real(constant) => Some([constant; N]),
-        Op::Int(constant) => Some([constant as u64; N]),
-        Op::Bool(constant) => Some([constant.into(); N]),
-        op => apply(op, InEachBlock(bits)),
+    /// Evaluates an expression of the bits of operands in each block.
+    macro_rules! each {
+        ($($operand:ident),* => $result:expr) => {{
+            $(let $operand = bits($operand);)*
+            let mut results = [0; N];
+            for (block, result) in results.iter_mut().enumerate() {
+                $(let $operand = $operand[block];)*
+                *result = $result;
+            }
+            results
+        }};
     }
-}
-
-/// Where the operands of operations are read, and what becomes of their results.
-pub(crate) trait Operands {
-    /// What an application returns.
-    type Results;
-    /// Applies the meaning of an operation with one operand.
-    fn one(self, operand: Value, meaning: impl Fn(u64) -> u64) -> Self::Results;
-    /// With two.
-    fn two(self, operands: [Value; 2], meaning: impl Fn(u64, u64) -> u64) -> Self::Results;
-    /// With three.
-    fn three(self, operands: [Value; 3], meaning: impl Fn(u64, u64, u64) -> u64) -> Self::Results;
-}
-
-/// Applies the meaning of `op` to operands. `None` for constants, for operations that read the block or the pool, and for
-/// elementary functions.
-#[inline(always)]
-pub(crate) fn apply<T>(op: Op, to: impl Operands<Results = T>) -> Option<T> {
     let real = f64::from_bits;
     let int = |bits: u64| bits as i64;
     Some(match op {
-        Op::Real(_) | Op::Int(_) | Op::Bool(_) => return None,
         Op::Load(_) | Op::Pool { .. } | Op::Ring { .. } | Op::Unary(..) | Op::Binary(..) => return None,
-        Op::Add(a, b) => to.two([a, b], |a, b| (real(a) + real(b)).to_bits()),
-        Op::Sub(a, b) => to.two([a, b], |a, b| (real(a) - real(b)).to_bits()),
-        Op::Mul(a, b) => to.two([a, b], |a, b| (real(a) * real(b)).to_bits()),
-        Op::Div(a, b) => to.two([a, b], |a, b| (real(a) / real(b)).to_bits()),
-        Op::Neg(a) => to.one(a, |a| (-real(a)).to_bits()),
-        Op::Abs(a) => to.one(a, |a| real(a).abs().to_bits()),
-        Op::Sqrt(a) => to.one(a, |a| real(a).sqrt().to_bits()),
-        Op::Fma(a, b, c) => to.three([a, b, c], |a, b, c| real(a).mul_add(real(b), real(c)).to_bits()),
-        Op::Floor(a) => to.one(a, |a| real(a).floor().to_bits()),
-        Op::Nearest(a) => to.one(a, |a| real(a).round_ties_even().to_bits()),
-        Op::Less(a, b) => to.two([a, b], |a, b| (real(a) < real(b)).into()),
-        Op::LessEqual(a, b) => to.two([a, b], |a, b| (real(a) <= real(b)).into()),
-        Op::Equal(a, b) => to.two([a, b], |a, b| (real(a) == real(b)).into()),
-        Op::And(a, b) => to.two([a, b], |a, b| a & b),
-        Op::Or(a, b) => to.two([a, b], |a, b| a | b),
-        Op::Not(a) => to.one(a, |a| a ^ 1),
-        Op::Select(a, b, c) => to.three([a, b, c], |a, b, c| if a != 0 { b } else { c }),
-        Op::IntAdd(a, b) => to.two([a, b], u64::wrapping_add),
-        Op::IntSub(a, b) => to.two([a, b], u64::wrapping_sub),
-        Op::IntMul(a, b) => to.two([a, b], u64::wrapping_mul),
-        Op::IntAnd(a, b) => to.two([a, b], |a, b| a & b),
-        Op::IntOr(a, b) => to.two([a, b], |a, b| a | b),
-        Op::IntXor(a, b) => to.two([a, b], |a, b| a ^ b),
-        Op::ShiftLeft(a, n) => to.one(a, |a| a << n),
-        Op::ShiftRight(a, n) => to.one(a, |a| a >> n),
-        Op::ShiftRightSigned(a, n) => to.one(a, |a| (int(a) >> n) as u64),
-        Op::IntLess(a, b) => to.two([a, b], |a, b| (int(a) < int(b)).into()),
-        Op::IntEqual(a, b) => to.two([a, b], |a, b| (a == b).into()),
-        Op::ToBits(a) | Op::FromBits(a) => to.one(a, |a| a),
-        Op::ToInt(a) => to.one(a, |a| real(a) as i64 as u64),
-        Op::ToReal(a) => to.one(a, |a| (int(a) as f64).to_bits()),
+        Op::Real(constant) => [constant; N],
+        Op::Int(constant) => [constant as u64; N],
+        Op::Bool(constant) => [constant.into(); N],
+        Op::Add(a, b) => each!(a, b => (real(a) + real(b)).to_bits()),
+        Op::Sub(a, b) => each!(a, b => (real(a) - real(b)).to_bits()),
+        Op::Mul(a, b) => each!(a, b => (real(a) * real(b)).to_bits()),
+        Op::Div(a, b) => each!(a, b => (real(a) / real(b)).to_bits()),
+        Op::Neg(a) => each!(a => (-real(a)).to_bits()),
+        Op::Abs(a) => each!(a => real(a).abs().to_bits()),
+        Op::Sqrt(a) => each!(a => real(a).sqrt().to_bits()),
+        Op::Fma(a, b, c) => each!(a, b, c => real(a).mul_add(real(b), real(c)).to_bits()),
+        Op::Floor(a) => each!(a => real(a).floor().to_bits()),
+        Op::Nearest(a) => each!(a => real(a).round_ties_even().to_bits()),
+        Op::Less(a, b) => each!(a, b => (real(a) < real(b)).into()),
+        Op::LessEqual(a, b) => each!(a, b => (real(a) <= real(b)).into()),
+        Op::Equal(a, b) => each!(a, b => (real(a) == real(b)).into()),
+        Op::And(a, b) => each!(a, b => a & b),
+        Op::Or(a, b) => each!(a, b => a | b),
+        Op::Not(a) => each!(a => a ^ 1),
+        Op::Select(a, b, c) => each!(a, b, c => if a != 0 { b } else { c }),
+        Op::IntAdd(a, b) => each!(a, b => a.wrapping_add(b)),
+        Op::IntSub(a, b) => each!(a, b => a.wrapping_sub(b)),
+        Op::IntMul(a, b) => each!(a, b => a.wrapping_mul(b)),
+        Op::IntAnd(a, b) => each!(a, b => a & b),
+        Op::IntOr(a, b) => each!(a, b => a | b),
+        Op::IntXor(a, b) => each!(a, b => a ^ b),
+        Op::ShiftLeft(a, n) => each!(a => a << n),
+        Op::ShiftRight(a, n) => each!(a => a >> n),
+        Op::ShiftRightSigned(a, n) => each!(a => (int(a) >> n) as u64),
+        Op::IntLess(a, b) => each!(a, b => (int(a) < int(b)).into()),
+        Op::IntEqual(a, b) => each!(a, b => (a == b).into()),
+        Op::ToBits(a) | Op::FromBits(a) => bits(a),
+        Op::ToInt(a) => each!(a => real(a) as i64 as u64),
+        Op::ToReal(a) => each!(a => (int(a) as f64).to_bits()),
     })
-}
-
-/// The operands of one operation, with their bits in each of `N` blocks.
-struct InEachBlock<F>(F);
-
-impl<const N: usize, F: Fn(Value) -> [u64; N]> Operands for InEachBlock<F> {
-    type Results = [u64; N];
-
-    #[inline(always)]
-    fn one(self, a: Value, meaning: impl Fn(u64) -> u64) -> [u64; N] {
-        let a = self.0(a);
-        from_fn(|block| meaning(a[block]))
-    }
-
-    #[inline(always)]
-    fn two(self, [a, b]: [Value; 2], meaning: impl Fn(u64, u64) -> u64) -> [u64; N] {
-        let (a, b) = (self.0(a), self.0(b));
-        from_fn(|block| meaning(a[block], b[block]))
-    }
-
-    #[inline(always)]
-    fn three(self, [a, b, c]: [Value; 3], meaning: impl Fn(u64, u64, u64) -> u64) -> [u64; N] {
-        let (a, b, c) = (self.0(a), self.0(b), self.0(c));
-        from_fn(|block| meaning(a[block], b[block], c[block]))
-    }
 }
 
 #[cfg(test)]

@@ -206,9 +206,9 @@ fn operations<const N: usize>(
     }
 }
 
-/// Stores what a function stores and writes. `values`: by the numbers that its stores and writes name.
+/// Stores the results of a function.
 #[inline(always)]
-pub(crate) fn results<const N: usize>(func: &Func, blocks: &mut [&mut [f64]], values: &[[u64; N]]) {
+fn results<const N: usize>(func: &Func, blocks: &mut [&mut [f64]], values: &[[u64; N]]) {
     for (lane, block) in blocks.iter_mut().enumerate() {
         for (slot, value) in &func.stores {
             block[slot.index()] = f64::from_bits(values[value.index()][lane]);

@@ -54,17 +54,17 @@ pub fn components(n: usize, edge: impl Fn(usize, usize) -> Option<usize>) -> Vec
 /// Depth-first postorder of a directed acyclic graph: every node that the roots need, once and after its operands. The
 /// nodes that only one root needs are contiguous. `index`: a number for each node, below `count`. `is_read`: nodes to
 /// leave out, with what only they need. `operands`: the operands of a node, in the order of evaluation.
-pub fn topological_order<N: Copy>(
+pub fn topological_order<N: Copy, O: IntoIterator<Item = N, IntoIter: DoubleEndedIterator>>(
     roots: &[N],
     count: usize,
     index: impl Fn(N) -> usize,
     is_read: impl Fn(N) -> bool,
-    operands: impl Fn(N) -> Vec<N>,
+    operands: impl Fn(N) -> O,
 ) -> Vec<N> {
     let mut done = vec![false; count];
-    let mut out = Vec::new();
+    let (mut open, mut out) = (Vec::new(), Vec::new());
     for root in roots {
-        let mut open = vec![(*root, false)];
+        open.push((*root, false));
         while let Some((node, ready)) = open.pop() {
             if done[index(node)] || is_read(node) {
                 continue;

@@ -108,33 +108,6 @@ pub fn exp(x: Real) -> Real {
     Parts::of(x).scaled(x, 0)
 }
 
-/// The same bits as [`exp`], of a number: for an interpreter, to which each operation costs a multiple of itself.
-#[inline(always)]
-pub fn exp_of(x: f64) -> f64 {
-    let rounded = x.mul_add(STEPS, ROUND);
-    let (k, bits) = (rounded - ROUND, rounded.to_bits());
-    let r = k.mul_add(-STEP.1, k.mul_add(-STEP.0, x));
-    let index = (bits % u64::from(tables::EXP_LEN)) as usize;
-    let scale = tables::POOL[tables::EXP_SCALE as usize + index].to_bits().wrapping_add(bits << 46);
-    let tail = tables::POOL[tables::EXP_TAIL as usize + index];
-    let square = r * r;
-    let q = square.mul_add(r.mul_add(EXP[3], EXP[2]), r.mul_add(EXP[1], EXP[0]));
-    let scaled_by = |scale: u64| {
-        let scale = f64::from_bits(scale);
-        scale.mul_add(square.mul_add(q, r + tail), scale)
-    };
-    if x.abs() < 707.0 {
-        return scaled_by(scale);
-    }
-    // As in `scaled`.
-    let (nearer, rest) = if x > 0.0 { (-1009_i64, two_to(1009)) } else { (1022, two_to(-1022)) };
-    match x {
-        x if x > 745.0 => f64::INFINITY,
-        x if x < -746.0 => 0.0,
-        _ => scaled_by(scale.wrapping_add((nearer << 52) as u64)) * rest,
-    }
-}
-
 /// The same bits as [`exp`] for x ≤ 0 or NaN, as in a Stribeck curve, without the operations for large results.
 pub fn exp_below(x: Real) -> Real {
     Parts::of(x).scaled_below(x)

@@ -43,10 +43,9 @@ pub fn expand(func: &Func) -> Func {
     })
 }
 
-/// Like [`expand`], with the same bits, but with the fewest operations: for lanes, which run side by side, and for
-/// interpreters, where latency does not matter. `kept`: functions that the back end computes itself; it must compute the
-/// same bits.
-pub fn expand_short(func: &Func, kept: &[Unary]) -> Func {
+/// Like [`expand`], with the same bits, but with the fewest operations: many lanes run side by side, so throughput
+/// matters more than latency. `kept`: functions that the back end computes itself; it must compute the same bits.
+pub fn expand_for_lanes(func: &Func, kept: &[Unary]) -> Func {
     expand_by(func, &|function, x, below| match function {
         function if kept.contains(&function) => None,
         Unary::Exp if below => Some(exponential::exp_below_of_lanes(x)),

@@ -10,6 +10,8 @@ use crate::ir::hash::HashMap;
 /// Kind of vector.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
 pub enum Vectors {
+    /// One lane of 64 bits in 16 registers: AVX and FMA.
+    Scalar,
     /// Two lanes of 64 bits in 16 registers: AVX and FMA.
     Avx,
     /// Four lanes of 64 bits in 16 registers: AVX2 and FMA.
@@ -22,6 +24,7 @@ impl Vectors {
     /// Lanes of a vector.
     pub fn lanes(self) -> usize {
         match self {
+            Vectors::Scalar => 1,
             Vectors::Avx => 2,
             Vectors::Avx2 => 4,
             Vectors::Avx512 => 8,
@@ -36,7 +39,7 @@ impl Vectors {
     /// Number of vector registers.
     pub fn registers(self) -> u8 {
         match self {
-            Vectors::Avx | Vectors::Avx2 => 16,
+            Vectors::Scalar | Vectors::Avx | Vectors::Avx2 => 16,
             Vectors::Avx512 => 32,
         }
     }
@@ -49,6 +52,8 @@ pub enum Base {
     Block = 7,
     /// rsi: the pool.
     Pool = 6,
+    /// rdx: scratch space.
+    Scratch = 2,
     /// rcx: the statuses.
     Statuses = 1,
     /// r8: the carried slots at the start of an iteration.
@@ -78,6 +83,22 @@ pub enum Place {
 /// the EVEX and of the VEX form, opcode. In the comments d is the destination, v the second and rm the last operand.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
 pub struct Instruction(pub u8, pub u8, pub [u8; 2], pub u8);
+
+impl Instruction {
+    /// The same for a single double, which it reads from memory where the instruction reads a vector. None for
+    /// operations on bits and on integers.
+    pub fn scalar(self) -> Option<Instruction> {
+        let Instruction(prefix, map, w, opcode) = self;
+        match (prefix, map, opcode) {
+            // Moves from and to memory that need no alignment, arithmetic, comparisons.
+            (1, 1, 0x10 | 0x11 | 0x51 | 0x58 | 0x59 | 0x5c..=0x5f | 0xc2) => Some(Instruction(3, map, w, opcode)),
+            (1, 1, 0x28 | 0x29) => Some(Instruction(3, map, w, opcode - 0x18)),
+            (1, 3, 0x09) => Some(Instruction(prefix, map, w, 0x0b)),
+            (1, 2, 0x98..=0xbf) => Some(Instruction(prefix, map, w, opcode + 1)),
+            _ => None,
+        }
+    }
+}
 
 #[rustfmt::skip]
 #[allow(missing_docs)]
@@ -124,6 +145,14 @@ pub mod instructions {
     pub const VUNPCKHPD: Instruction = Instruction(1, 1, [1, 0], 0x15);
     /// A single double from memory, into the low lane.
     pub const VMOVSD: Instruction = Instruction(3, 1, [0, 0], 0x10);
+    pub const VMOVSD_STORE: Instruction = Instruction(3, 1, [0, 0], 0x11);
+    /// Between a lane (reg) and a general register (rm). VEX only, as the conversions that follow.
+    pub const VMOVQ_FROM_GENERAL: Instruction = Instruction(1, 1, [1, 1], 0x6e);
+    pub const VMOVQ_TO_GENERAL: Instruction = Instruction(1, 1, [1, 1], 0x7e);
+    /// From rm, a general register; v gives the upper lane.
+    pub const VCVTSI2SD: Instruction = Instruction(3, 1, [1, 1], 0x2a);
+    /// To reg, a general register.
+    pub const VCVTTSD2SI: Instruction = Instruction(3, 1, [1, 1], 0x2c);
     pub const VMOVHPD: Instruction = Instruction(1, 1, [0, 0], 0x16);
     pub const VPCMPEQQ: Instruction = Instruction(1, 2, [1, 0], 0x29);
     pub const VPCMPGTQ: Instruction = Instruction(1, 2, [1, 0], 0x37);
@@ -176,6 +205,10 @@ pub struct Assembler {
     table_reference: Option<usize>,
 }
 
+/// General registers that no base needs.
+const R10: u8 = 10;
+const R11: u8 = 11;
+
 /// Added to the number of a mask register: lanes that are masked off become 0 instead of keeping their content.
 pub const ZEROING: u8 = 1 << 7;
 
@@ -219,7 +252,22 @@ impl Assembler {
                 self.vex(instruction, reg, second, last, u8::from(self.width == Vectors::Avx2));
                 self.operand(reg, last, immediate, 1);
             }
+            Vectors::Scalar => self.scalar(instruction, reg, second, last, immediate),
         }
+    }
+
+    /// Emits an instruction on one lane.
+    fn scalar(&mut self, instruction: Instruction, reg: u8, second: u8, last: Place, immediate: Option<u8>) {
+        let is_move = matches!(instruction, instructions::VMOVAPD_LOAD | instructions::VMOVAPD_STORE);
+        let form = instruction.scalar().filter(|_| !is_move || !matches!(last, Place::Register(_)));
+        let second = match (instruction, last) {
+            // These take the upper lane, which nobody reads, from another register.
+            (instructions::VSQRTPD | instructions::VROUNDPD, Place::Register(last)) => last,
+            (instructions::VSQRTPD | instructions::VROUNDPD, _) => reg,
+            _ => second,
+        };
+        self.vex(form.unwrap_or(instruction), reg, second, last, 0);
+        self.operand(reg, last, immediate, 1);
     }
 
     /// Emits an instruction on mask registers.
@@ -254,6 +302,53 @@ impl Assembler {
         if self.width == Vectors::Avx2 {
             self.vector(instructions::VINSERTF128, to, to, Place::Register(half), Some(1));
         }
+    }
+
+    /// Loads the entry of a table at an index. `table`: where it begins, in bytes. Scalar only.
+    pub fn look_up_one(&mut self, to: u8, index: u8, (base, displacement): (Base, i32)) {
+        self.copy_to_general(R10, index);
+        self.table_entry(instructions::VMOVSD, to, 0, 0, (base as u8, 8, displacement));
+    }
+
+    /// Writes an entry. Scalar only.
+    pub fn write_one(&mut self, value: u8, index: u8, (base, displacement): (Base, i32)) {
+        self.copy_to_general(R10, index);
+        self.table_entry(instructions::VMOVSD_STORE, value, 0, 0, (base as u8, 8, displacement));
+    }
+
+    /// The product of two integers, modulo 2^64. Scalar only.
+    pub fn integer_product(&mut self, to: u8, a: u8, b: u8) {
+        self.copy_to_general(R10, a);
+        self.copy_to_general(R11, b);
+        self.raw(&[0x4d, 0x0f, 0xaf, 0xd3]); // imul r10, r11
+        self.copy_from_general(to, R10);
+    }
+
+    /// A real without its fraction as an integer; the least integer for NaN and out of range. Scalar only.
+    pub fn integer_of(&mut self, to: u8, from: u8) {
+        self.vex(instructions::VCVTTSD2SI, R10, 0, Place::Register(from), 0);
+        self.bytes.push(0xc0 | (R10 & 7) << 3 | from & 7);
+        self.copy_from_general(to, R10);
+    }
+
+    /// An integer as a real. Scalar only.
+    pub fn real_of(&mut self, to: u8, from: u8) {
+        self.copy_to_general(R10, from);
+        // The upper lane, which nobody reads, is taken from a register that is ready.
+        self.vex(instructions::VCVTSI2SD, to, from, Place::Register(R10), 0);
+        self.bytes.push(0xc0 | (to & 7) << 3 | R10 & 7);
+    }
+
+    /// Copies a lane to a general register.
+    fn copy_to_general(&mut self, to: u8, from: u8) {
+        self.vex(instructions::VMOVQ_TO_GENERAL, from, 0, Place::Register(to), 0);
+        self.bytes.push(0xc0 | (from & 7) << 3 | to & 7);
+    }
+
+    /// Copies a general register to a lane.
+    fn copy_from_general(&mut self, to: u8, from: u8) {
+        self.vex(instructions::VMOVQ_FROM_GENERAL, to, 0, Place::Register(from), 0);
+        self.bytes.push(0xc0 | (to & 7) << 3 | from & 7);
     }
 
     /// Loads entries of two interleaved tables, `displacement` bytes after r11, at the indices in a vector in memory, which are
@@ -435,6 +530,8 @@ impl Assembler {
         // EVEX broadcasts one double from memory; VEX needs a full vector.
         let copies = match self.width {
             Vectors::Avx512 => 1,
+            // Operations on bits and on integers are those of pairs.
+            Vectors::Scalar => 2,
             width => width.lanes(),
         };
         self.bytes.resize(self.bytes.len().next_multiple_of(64), 0xcc);
@@ -570,5 +667,47 @@ mod tests {
         );
         // korb k1, k2, k3
         check(Vectors::Avx512, |c| c.mask(KORB, 1, 2, Place::Register(3)), &[0xc5, 0xed, 0x45, 0xcb]);
+    }
+
+    /// Expected bytes are from the GNU assembler.
+    #[test]
+    fn a_single_lane_has_the_bytes_of_gnu_as() {
+        // vmovq r10, xmm9; vmovsd xmm3, [rsi+r10*8+0x40]
+        let look_up = [0xc4, 0x41, 0xf9, 0x7e, 0xca, 0xc4, 0xa1, 0x7b, 0x10, 0x5c, 0xd6, 0x40];
+        check(Vectors::Scalar, |c| c.look_up_one(3, 9, (Base::Pool, 0x40)), &look_up);
+        // vmovq r10, xmm1; vmovsd [rdi+r10*8+0x400], xmm12
+        let write = [0xc4, 0xc1, 0xf9, 0x7e, 0xca, 0xc4, 0x21, 0x7b, 0x11, 0xa4, 0xd7, 0, 4, 0, 0];
+        check(Vectors::Scalar, |c| c.write_one(12, 1, (Base::Block, 0x400)), &write);
+        // vmovq r10, xmm2; vmovq r11, xmm13; imul r10, r11; vmovq xmm8, r10
+        let product = [
+            [0xc4, 0xc1, 0xf9, 0x7e, 0xd2].as_slice(),
+            &[0xc4, 0x41, 0xf9, 0x7e, 0xeb],
+            &[0x4d, 0x0f, 0xaf, 0xd3],
+            &[0xc4, 0x41, 0xf9, 0x6e, 0xc2],
+        ]
+        .concat();
+        check(Vectors::Scalar, |c| c.integer_product(8, 2, 13), &product);
+        // vcvttsd2si r10, xmm11; vmovq xmm4, r10
+        let integer = [0xc4, 0x41, 0xfb, 0x2c, 0xd3, 0xc4, 0xc1, 0xf9, 0x6e, 0xe2];
+        check(Vectors::Scalar, |c| c.integer_of(4, 11), &integer);
+        // vmovq r10, xmm5; vcvtsi2sd xmm9, xmm5, r10
+        let real = [0xc4, 0xc1, 0xf9, 0x7e, 0xea, 0xc4, 0x41, 0xd3, 0x2a, 0xca];
+        check(Vectors::Scalar, |c| c.real_of(9, 5), &real);
+        let one = |instruction, reg, second, last, immediate: Option<u8>, expected: &[u8]| {
+            check(Vectors::Scalar, |c| c.vector(instruction, reg, second, last, immediate), expected);
+        };
+        // vaddsd xmm9, xmm1, [rdx+0x18]; vfnmadd231sd xmm9, xmm1, xmm2; vcmplt_oqsd xmm1, xmm2, xmm3
+        one(VADDPD, 9, 1, Place::Memory(Base::Scratch, 0x18), None, &[0xc5, 0x73, 0x58, 0x4a, 0x18]);
+        let negated = Instruction(1, 2, [1, 1], VFMADD231PD.3 + 4);
+        one(negated, 9, 1, Place::Register(2), None, &[0xc4, 0x62, 0xf1, 0xbd, 0xca]);
+        one(VCMPPD, 1, 2, Place::Register(3), Some(0x11), &[0xc5, 0xeb, 0xc2, 0xcb, 0x11]);
+        // vsqrtsd xmm9, xmm12, xmm12; vroundsd xmm1, xmm1, [rdi+8], 9
+        one(VSQRTPD, 9, 0, Place::Register(12), None, &[0xc4, 0x41, 0x1b, 0x51, 0xcc]);
+        one(VROUNDPD, 1, 0, Place::Memory(Base::Block, 8), Some(9), &[0xc4, 0xe3, 0x71, 0x0b, 0x4f, 8, 9]);
+        // vmovsd xmm2, [rdi+0x10]; vmovsd [rdx+0x10], xmm10; vmovapd xmm10, xmm2; vandpd xmm1, xmm2, xmm3
+        one(VMOVAPD_LOAD, 2, 0, Place::Memory(Base::Block, 16), None, &[0xc5, 0xfb, 0x10, 0x57, 0x10]);
+        one(VMOVAPD_STORE, 10, 0, Place::Memory(Base::Scratch, 16), None, &[0xc5, 0x7b, 0x11, 0x52, 0x10]);
+        one(VMOVAPD_LOAD, 10, 0, Place::Register(2), None, &[0xc5, 0x79, 0x28, 0xd2]);
+        one(VANDPD, 1, 2, Place::Register(3), None, &[0xc5, 0xe9, 0x54, 0xcb]);
     }
 }

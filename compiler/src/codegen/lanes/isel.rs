@@ -10,7 +10,7 @@
 use crate::codegen::lanes::assembler::{Instruction, Vectors, instructions as i};
 use crate::codegen::unsupported::Unsupported;
 use crate::ir::hash::HashMap;
-use crate::ir::{Func, Op, Type, Unary, Value, is_not_positive, sign_of, verify};
+use crate::ir::{Func, Op, Type, Unary, Value, Write, is_not_positive, sign_of, verify};
 use crate::math::{self, exponential, tables};
 use abi::Slot;
 
@@ -135,6 +135,11 @@ pub enum MachineOp {
         len: u32,
         index: NodeId,
     },
+    /// The entry of the ring at a slot of the block; the index is in range. Scalar only.
+    Ring(Slot, NodeId),
+    /// A write of the second operand to the ring at a slot, at the index of the first, which is in range. It has no value.
+    /// Scalar only.
+    Write(Slot, NodeId, NodeId),
     /// Eight entries of a table: the first half of a quarter, or the second. The same in every vector. AVX-512 only.
     TableRow(TableQuarter, bool),
     /// Entries of a table of sixteen, which two rows hold, by the low four bits of an integer. AVX-512 only.
@@ -181,13 +186,15 @@ impl MachineOp {
             MachineOp::Unary(_, _, a)
             | MachineOp::Shift(_, a, _)
             | MachineOp::MaskNot(a)
+            | MachineOp::Ring(_, a)
             | MachineOp::Gather { index: a, .. } => [Some(a), None, None],
             MachineOp::Binary(_, _, a, b)
             | MachineOp::Compare(_, a, b)
             | MachineOp::CompareInt(_, a, b)
             | MachineOp::TestBits(a, b)
             | MachineOp::MaskAnd(a, b)
-            | MachineOp::MaskOr(a, b) => [Some(a), Some(b), None],
+            | MachineOp::MaskOr(a, b)
+            | MachineOp::Write(_, a, b) => [Some(a), Some(b), None],
             MachineOp::Fma { a, b, c, .. }
             | MachineOp::Select(a, b, c)
             | MachineOp::MaskSelect(a, b, c)
@@ -226,6 +233,8 @@ impl MachineOp {
             | MachineOp::Select(..)
             | MachineOp::Scale(..)
             | MachineOp::Gather { .. }
+            | MachineOp::Ring(..)
+            | MachineOp::Write(..)
             | MachineOp::TableRow(..)
             | MachineOp::Permute(..) => false,
         }
@@ -237,6 +246,8 @@ pub struct Nodes {
     pub nodes: Vec<MachineOp>,
     /// Stores to slots of the block.
     pub stores: Vec<(Slot, NodeId)>,
+    /// Writes to rings, after the stores. Scalar only.
+    pub writes: Vec<NodeId>,
     /// The status, an integer per lane.
     pub status: Option<NodeId>,
     /// A mask; in lanes where it is not set the status is 0.
@@ -260,7 +271,7 @@ pub const SIGN: u64 = 1 << 63;
 /// # Errors
 /// If the width has no instruction for an operation.
 pub fn select(func: &Func, width: Vectors, pooled: bool) -> Result<Nodes, Unsupported> {
-    if !func.writes.is_empty() {
+    if !func.writes.is_empty() && width != Vectors::Scalar {
         return Err(Unsupported("a ring of samples (delay) has no lanes".into()));
     }
     let mut selection = Selection::new(width);
@@ -280,7 +291,12 @@ pub fn select(func: &Func, width: Vectors, pooled: bool) -> Result<Nodes, Unsupp
         }
     });
     let stores = func.stores.iter().map(|(slot, value)| (*slot, at(*value))).collect();
-    Ok(Nodes { stores, status: func.status.map(at), failed, nodes: selection.nodes, pooled })
+    let write = |write: &Write| {
+        let index = selection.clamped_index(func, write.index, write.len, &of);
+        selection.add(MachineOp::Write(write.base, index, at(write.value)))
+    };
+    let writes = func.writes.iter().map(write).collect();
+    Ok(Nodes { stores, writes, status: func.status.map(at), failed, nodes: selection.nodes, pooled })
 }
 
 struct Selection {
@@ -336,8 +352,12 @@ impl Selection {
     fn select_lanes(&mut self, when: NodeId, a: NodeId, b: NodeId) -> MachineOp {
         let zero = MachineOp::Constant(0);
         match (self.width, self.nodes[a.index()], self.nodes[b.index()]) {
-            (Vectors::Avx | Vectors::Avx2, a, _) if a == zero => MachineOp::Binary(i::VANDNPD, false, when, b),
-            (Vectors::Avx | Vectors::Avx2, _, b) if b == zero => MachineOp::Binary(i::VANDPD, true, when, a),
+            (Vectors::Scalar | Vectors::Avx | Vectors::Avx2, a, _) if a == zero => {
+                MachineOp::Binary(i::VANDNPD, false, when, b)
+            }
+            (Vectors::Scalar | Vectors::Avx | Vectors::Avx2, _, b) if b == zero => {
+                MachineOp::Binary(i::VANDPD, true, when, a)
+            }
             _ => MachineOp::Select(when, a, b),
         }
     }
@@ -349,6 +369,8 @@ impl Selection {
     fn node(&mut self, func: &Func, op: Op, of_type: Type, of: &[NodeId]) -> Result<NodeId, Unsupported> {
         let at = |value: Value| of[value.index()];
         let has_masks = self.width == Vectors::Avx512;
+        // Products of integers and conversions; a single lane has them in general registers.
+        let has_integers = has_masks || self.width == Vectors::Scalar;
         if let Some(x) = sign_of(op, |value| func.op(value)) {
             return Ok(self.sign(at(x)));
         }
@@ -362,6 +384,9 @@ impl Selection {
             Op::Pool { base, len, index } => {
                 let index = self.clamped_index(func, index, len, of);
                 MachineOp::Gather { base, len, index }
+            }
+            Op::Ring { base, len, index } if self.width == Vectors::Scalar => {
+                MachineOp::Ring(base, self.clamped_index(func, index, len, of))
             }
             Op::Ring { .. } => return Err(Unsupported("a ring of samples (delay) has no lanes".into())),
             Op::Add(a, b) => MachineOp::Binary(i::VADDPD, true, at(a), at(b)),
@@ -411,7 +436,7 @@ impl Selection {
             },
             Op::IntAdd(a, b) => MachineOp::Binary(i::VPADDQ, true, at(a), at(b)),
             Op::IntSub(a, b) => MachineOp::Binary(i::VPSUBQ, false, at(a), at(b)),
-            Op::IntMul(a, b) if has_masks => MachineOp::Binary(i::VPMULLQ, true, at(a), at(b)),
+            Op::IntMul(a, b) if has_integers => MachineOp::Binary(i::VPMULLQ, true, at(a), at(b)),
             Op::IntMul(..) => return Err(self.missing("product of integers")),
             Op::IntAnd(a, b) => MachineOp::Binary(i::VANDPD, true, at(a), at(b)),
             Op::IntOr(a, b) => MachineOp::Binary(i::VORPD, true, at(a), at(b)),
@@ -429,7 +454,7 @@ impl Selection {
             Op::IntLess(a, b) => MachineOp::CompareInt(1, at(a), at(b)),
             Op::IntEqual(a, b) => MachineOp::CompareInt(0, at(a), at(b)),
             Op::ToBits(a) | Op::FromBits(a) => return Ok(at(a)),
-            Op::ToInt(a) if has_masks => {
+            Op::ToInt(a) if has_integers => {
                 // The instruction returns the smallest integer for NaN and all values out of range; right only for
                 // those that are too small.
                 let raw = self.add(MachineOp::Unary(i::VCVTTPD2QQ, None, at(a)));
@@ -441,7 +466,7 @@ impl Selection {
                 MachineOp::Select(number, held, self.constant(0))
             }
             Op::ToInt(_) => return Err(self.missing("conversion to integers")),
-            Op::ToReal(a) if has_masks => MachineOp::Unary(i::VCVTQQ2PD, None, at(a)),
+            Op::ToReal(a) if has_integers => MachineOp::Unary(i::VCVTQQ2PD, None, at(a)),
             Op::ToReal(_) => return Err(self.missing("conversion from integers")),
         };
         Ok(self.add(machine_op))

@@ -7,6 +7,8 @@
 //! needs, such as outputs, are computed in the last step only. Carried slots alternate between two areas, so that a
 //! step in which a lane fails can be repeated in full, with statuses.
 //!
+//! [`baseline`] is the same for a single instance and one step.
+//!
 //! A loop over [rows](with_rows) also reads inputs from a row and writes outputs to one in each step.
 //!
 //! ```text
@@ -21,6 +23,7 @@ mod assembler;
 mod isel;
 mod schedule;
 mod regalloc;
+pub mod baseline;
 
 use super::target::{FunctionCompiler, here, most_lanes};
 use super::unsupported::Unsupported;
@@ -114,7 +117,9 @@ impl Vectors {
     #[cfg(all(target_arch = "x86_64", unix))]
     fn are_here(self) -> bool {
         match self {
-            Vectors::Avx => std::arch::is_x86_feature_detected!("avx") && std::arch::is_x86_feature_detected!("fma"),
+            Vectors::Scalar | Vectors::Avx => {
+                std::arch::is_x86_feature_detected!("avx") && std::arch::is_x86_feature_detected!("fma")
+            }
             Vectors::Avx2 => std::arch::is_x86_feature_detected!("avx2") && std::arch::is_x86_feature_detected!("fma"),
             Vectors::Avx512 => {
                 std::arch::is_x86_feature_detected!("avx512f") && std::arch::is_x86_feature_detected!("avx512dq")
@@ -236,7 +241,7 @@ pub fn bytes(
     // Expanded functions read the tables with which the pool of every model begins. A step without elementary functions
     // works with any pool.
     let elementary = func.has_elementary_functions();
-    let expanded = elementary.then(|| math::expand_short(func, own));
+    let expanded = elementary.then(|| math::expand_for_lanes(func, own));
     let func = expanded.as_ref().unwrap_or(func);
     match width.vectors_of_x64() {
         Some(own) => {
@@ -275,11 +280,11 @@ fn generate(
         end: spills_at,
     } = plan(&nodes, layout.size(), vectors * vector, rows);
     let column = |slot: Slot| rows.and_then(|rows| rows.inputs.iter().position(|input| *input == slot));
-    let to_row = |node: NodeId| {
-        let of = recorded.iter().filter(move |(_, recorded)| *recorded == node);
-        of.map(|(column, _)| Home { base: Base::Outputs, begin: 0, index: *column })
+    let to_rows = || {
+        let home = |column| Home { base: Base::Outputs, begin: 0, index: column };
+        recorded.iter().map(move |(column, node)| (*node, home(*column)))
     };
-    let mut homes: HashMap<NodeId, Home> = HashMap::default();
+    let mut homes: Vec<Option<Home>> = vec![None; nodes.nodes.len()];
     for (index, node) in nodes.nodes.iter().enumerate() {
         if let MachineOp::Load(slot) = node {
             let home = match (carried.iter().position(|(known, _)| known == slot), column(*slot)) {
@@ -287,7 +292,7 @@ fn generate(
                 (None, Some(index)) => Home { base: Base::Inputs, begin: 0, index },
                 (None, None) => Home { base: Base::Block, begin: 0, index: slot.index() },
             };
-            homes.insert(NodeId(index as u32), home);
+            homes[index] = Some(home);
         }
     }
     let mut code = Assembler::new(width);
@@ -303,18 +308,14 @@ fn generate(
         code.load_table_address();
     }
     let mut spill_slots = 0;
-    let store_hoisted = |node: NodeId| {
-        hoisted.iter().position(|known| *known == node).map(|index| Home {
-            base: Base::Block,
-            begin: hoisted_at,
-            index,
-        })
-    };
-    let mut body = RegisterAllocator::new(&mut code, &nodes, &prologue, &homes, width, vectors, spills_at);
-    body.write(&|node| store_hoisted(node).into_iter().collect(), &[]);
+    let hoisted_home = |index| Home { base: Base::Block, begin: hoisted_at, index };
+    let store_hoisted = hoisted.iter().enumerate().map(|(index, node)| (*node, hoisted_home(index)));
+    let mut body =
+        RegisterAllocator::new(&mut code, &nodes, &prologue, &homes, width, vectors, (Base::Block, spills_at));
+    body.write(&by_node(store_hoisted), &[]);
     spill_slots = spill_slots.max(body.spilled());
     for (index, node) in hoisted.iter().enumerate() {
-        homes.insert(*node, Home { base: Base::Block, begin: hoisted_at, index });
+        homes[node.index()] = Some(hoisted_home(index));
     }
     for (index, (slot, _)) in carried.iter().enumerate() {
         for k in 0..vectors {
@@ -345,17 +346,16 @@ fn generate(
     let mut to_final = vec![code.jump(&[0x0f, 0x83])]; // jae
     let is_loop = !carried.is_empty() || rows.is_some();
     if is_loop {
-        let to_area = |node: NodeId| {
-            let of = carried.iter().enumerate().filter(|(_, (_, next))| *next == node);
-            of.map(|(index, _)| Home { base: Base::After, begin: 0, index }).chain(to_row(node)).collect()
-        };
+        let after = |index| Home { base: Base::After, begin: 0, index };
+        let to_area = carried.iter().enumerate().map(|(index, (_, next))| (*next, after(index)));
         let all = carried.iter().map(|(_, node)| *node).chain(recorded.iter().map(|(_, node)| *node));
         let carried_values: Vec<NodeId> = all.collect();
-        let mut body = RegisterAllocator::new(&mut code, &nodes, &body_order, &homes, width, vectors, spills_at);
+        let mut body =
+            RegisterAllocator::new(&mut code, &nodes, &body_order, &homes, width, vectors, (Base::Block, spills_at));
         if let Some(failed) = nodes.failed {
             body.pin(failed);
         }
-        body.write(&to_area, &carried_values);
+        body.write(&by_node(to_area.chain(to_rows())), &carried_values);
         if let Some(failed) = nodes.failed {
             to_final.push(body.branch_if_any(failed));
         }
@@ -373,16 +373,12 @@ fn generate(
     }
     let last = code.position();
     to_final.into_iter().for_each(|jump| code.bind(jump, last));
-    let to_block = |node: NodeId| {
-        let stores = nodes.stores.iter().filter(|(_, value)| *value == node);
-        let mut homes: Vec<Home> =
-            stores.map(|(slot, _)| Home { base: Base::Block, begin: 0, index: slot.index() }).collect();
-        homes.extend((nodes.status == Some(node)).then_some(Home { base: Base::Statuses, begin: 0, index: 0 }));
-        homes.extend(to_row(node));
-        homes
-    };
-    let mut body = RegisterAllocator::new(&mut code, &nodes, &final_order, &homes, width, vectors, spills_at);
-    body.write(&to_block, &nodes.results().collect::<Vec<_>>());
+    let to_block =
+        nodes.stores.iter().map(|(slot, node)| (*node, Home { base: Base::Block, begin: 0, index: slot.index() }));
+    let to_status = nodes.status.map(|node| (node, Home { base: Base::Statuses, begin: 0, index: 0 }));
+    let mut body =
+        RegisterAllocator::new(&mut code, &nodes, &final_order, &homes, width, vectors, (Base::Block, spills_at));
+    body.write(&by_node(to_block.chain(to_status).chain(to_rows())), &nodes.results().collect::<Vec<_>>());
     spill_slots = spill_slots.max(body.spilled());
     if !is_loop {
         code.raw(&[0x48, 0x89, 0xd0]); // mov rax, rdx
@@ -400,4 +396,11 @@ fn generate(
         return Err(Unsupported(format!("`{}` is too large for lanes: {} operations", func.name, func.ops.len())));
     }
     Ok((code.finish(), scratch))
+}
+
+/// Where each node is stored.
+fn by_node(stores: impl Iterator<Item = (NodeId, Home)>) -> HashMap<NodeId, Vec<Home>> {
+    let mut of: HashMap<NodeId, Vec<Home>> = HashMap::default();
+    stores.for_each(|(node, home)| of.entry(node).or_default().push(home));
+    of
 }

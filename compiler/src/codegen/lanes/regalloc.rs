@@ -27,53 +27,105 @@ pub fn place_in(base: Base, begin: usize, index: usize, vectors: usize, k: usize
     Place::Memory(base, (begin + (index * vectors + k) * width.bytes() as usize) as i32)
 }
 
-/// One vector of a node: node index · number of vectors + vector. Nodes that all vectors share have the first one only.
-type VirtualRegister = usize;
+/// One vector of a node. Nodes that all vectors share have the first one only.
+#[derive(Clone, Copy)]
+struct VirtualRegister {
+    node: NodeId,
+    k: usize,
+}
+
+/// Where the nodes of a line are read.
+struct Uses {
+    /// For each node which of the positions are its own and still to come.
+    rest: Vec<Range<u32>>,
+    /// Positions in the order.
+    positions: Vec<u32>,
+}
+
+impl Uses {
+    fn new(nodes: &Nodes, order: &[NodeId]) -> Uses {
+        let reads = |node: &NodeId| nodes.nodes[node.index()].operands();
+        let mut rest = vec![0..0; nodes.nodes.len()];
+        order.iter().flat_map(reads).for_each(|read| rest[read.index()].end += 1);
+        let mut all = 0;
+        for Range { start, end } in &mut rest {
+            (*start, all) = (all, all + *end);
+            *end = *start;
+        }
+        let mut positions = vec![0; all as usize];
+        for (at, node) in order.iter().enumerate() {
+            for read in reads(node) {
+                let end = &mut rest[read.index()].end;
+                positions[*end as usize] = at as u32;
+                *end += 1;
+            }
+        }
+        Uses { rest, positions }
+    }
+
+    /// The positions where a node is read that have not been [passed](Uses::pass), ascending.
+    fn of(&self, node: NodeId) -> &[u32] {
+        let Range { start, end } = self.rest[node.index()];
+        &self.positions[start as usize..end as usize]
+    }
+
+    /// Forgets that a position reads these nodes.
+    fn pass(&mut self, at: usize, nodes: impl Iterator<Item = NodeId>) {
+        for node in nodes {
+            while self.of(node).first() == Some(&(at as u32)) {
+                self.rest[node.index()].start += 1;
+            }
+        }
+    }
+}
+
+/// What a register holds.
+#[derive(Clone, Copy)]
+struct Held {
+    virtual_register: VirtualRegister,
+    next_use: Option<usize>,
+    is_in_memory: bool,
+}
 
 /// Register allocation and emission of one straight line.
 pub struct RegisterAllocator<'a> {
     code: &'a mut Assembler,
     nodes: &'a Nodes,
     order: &'a [NodeId],
-    homes: &'a HashMap<NodeId, Home>,
+    homes: &'a [Option<Home>],
     width: Vectors,
     vectors: usize,
-    /// For each node the positions in the order where it is read, ascending.
-    uses: HashMap<NodeId, Vec<usize>>,
-    /// The register of each virtual register that has one.
-    register: HashMap<VirtualRegister, u8>,
-    /// The spill slot of each virtual register that has one.
-    spills: HashMap<VirtualRegister, usize>,
-    free_spills: Vec<usize>,
-    freed_by_instruction: Vec<usize>,
+    uses: Uses,
+    /// A node that is live to the end of the line.
+    pinned: Option<NodeId>,
+    /// For each virtual register its register, if it has one.
+    register: Vec<Option<u8>>,
+    /// For each virtual register its spill slot, if it has one.
+    spills: Vec<Option<u32>>,
+    free_spills: Vec<u32>,
+    freed_by_instruction: Vec<u32>,
     spilled: usize,
-    spills_at: usize,
-    vector_of: Vec<Option<VirtualRegister>>,
-    mask_of: Vec<Option<VirtualRegister>>,
-    /// Registers that the current instruction needs, as (is a mask, register).
-    locked: Vec<(bool, u8)>,
+    /// Where the spill slots begin, in bytes.
+    spills_at: (Base, usize),
+    vector_of: Vec<Option<Held>>,
+    mask_of: Vec<Option<Held>>,
+    /// Registers that the current instruction needs, as bits: those for vectors and those for masks.
+    locked: [u32; 2],
     /// The current position in the order, and the current vector.
     now: (usize, usize),
 }
 
 impl<'a> RegisterAllocator<'a> {
-    /// An allocator without any values in registers. Spill slots begin at `spills_at` bytes after the start of the
-    /// block.
+    /// An allocator without any values in registers. Spill slots begin at `spills_at` bytes after a base.
     pub fn new(
         code: &'a mut Assembler,
         nodes: &'a Nodes,
         order: &'a [NodeId],
-        homes: &'a HashMap<NodeId, Home>,
+        homes: &'a [Option<Home>],
         width: Vectors,
         vectors: usize,
-        spills_at: usize,
+        spills_at: (Base, usize),
     ) -> RegisterAllocator<'a> {
-        let mut uses: HashMap<NodeId, Vec<usize>> = HashMap::default();
-        for (at, node) in order.iter().enumerate() {
-            for operand in nodes.nodes[node.index()].operands() {
-                uses.entry(operand).or_default().push(at);
-            }
-        }
         RegisterAllocator {
             code,
             nodes,
@@ -81,23 +133,24 @@ impl<'a> RegisterAllocator<'a> {
             homes,
             width,
             vectors,
-            uses,
-            register: HashMap::default(),
-            spills: HashMap::default(),
+            uses: Uses::new(nodes, order),
+            pinned: None,
+            register: vec![None; nodes.nodes.len() * vectors],
+            spills: vec![None; nodes.nodes.len() * vectors],
             free_spills: Vec::new(),
             freed_by_instruction: Vec::new(),
             spilled: 0,
             spills_at,
             vector_of: vec![None; width.registers() as usize],
             mask_of: vec![None; 8],
-            locked: Vec::new(),
+            locked: [0; 2],
             now: (0, 0),
         }
     }
 
     /// Keeps a node live to the end of the line.
     pub fn pin(&mut self, node: NodeId) {
-        self.uses.entry(node).or_default().push(self.order.len() + 1);
+        self.pinned = Some(node);
     }
 
     /// The largest number of spill slots used at a time.
@@ -107,31 +160,32 @@ impl<'a> RegisterAllocator<'a> {
 
     /// Emits all nodes in order. `stores` says where a node is to be stored as soon as it is computed. Nodes of
     /// `stored_last` that are not in the order are stored at the end.
-    pub fn write(&mut self, stores: &dyn Fn(NodeId) -> Vec<Home>, stored_last: &[NodeId]) {
+    pub fn write(&mut self, stores: &HashMap<NodeId, Vec<Home>>, stored_last: &[NodeId]) {
         let order = self.order;
+        let mut is_done = vec![false; self.nodes.nodes.len()];
+        let homes = |node: NodeId| stores.get(&node).map_or(&[][..], Vec::as_slice);
         for (at, node) in order.iter().enumerate() {
-            let homes = stores(*node);
+            is_done[node.index()] = true;
             for k in 0..self.vectors {
                 self.now = (at, k);
                 self.node(*node);
-                for home in &homes {
+                for home in homes(*node) {
                     let register = self.in_register(*node);
                     self.store(*node, register, self.at_home(*home, k));
                 }
                 self.end_instruction(*node);
             }
+            self.uses.pass(at, self.op(*node).operands());
         }
-        let mut seen: Vec<NodeId> = order.to_vec();
         for node in stored_last {
-            if seen.contains(node) {
+            if std::mem::replace(&mut is_done[node.index()], true) {
                 continue;
             }
-            seen.push(*node);
             for k in 0..self.vectors {
                 self.now = (order.len(), k);
                 let register = self.in_register(*node);
-                for home in stores(*node) {
-                    self.store(*node, register, self.at_home(home, k));
+                for home in homes(*node) {
+                    self.store(*node, register, self.at_home(*home, k));
                 }
                 self.end_instruction(*node);
             }
@@ -143,6 +197,7 @@ impl<'a> RegisterAllocator<'a> {
     pub fn branch_if_any(&mut self, mask: NodeId) -> usize {
         self.now = (self.order.len(), 0);
         let all = self.in_register(mask);
+        let locked = self.locked;
         for k in 1..self.vectors {
             self.now.1 = k;
             match self.width {
@@ -150,16 +205,16 @@ impl<'a> RegisterAllocator<'a> {
                     let more = self.in_register(mask);
                     self.code.mask(i::KORB, all, all, Place::Register(more));
                 }
-                Vectors::Avx | Vectors::Avx2 => {
+                Vectors::Scalar | Vectors::Avx | Vectors::Avx2 => {
                     let more = self.operand(mask);
                     self.code.vector(i::VORPD, all, all, more, None);
                 }
             }
-            self.locked.truncate(1);
+            self.locked = locked;
         }
         match self.width {
             Vectors::Avx512 => self.code.mask(i::KORTESTB, all, 0, Place::Register(all)),
-            Vectors::Avx | Vectors::Avx2 => {
+            Vectors::Scalar | Vectors::Avx | Vectors::Avx2 => {
                 let l = u8::from(self.width == Vectors::Avx2);
                 self.code.raw(&[0xc4, 0x41 | (!all >> 3 & 1) << 5, 0x79 | l << 2, 0x50, 0xd0 | all & 7]);
                 self.code.raw(&[0x45, 0x85, 0xd2]); // test r10d, r10d
@@ -169,7 +224,12 @@ impl<'a> RegisterAllocator<'a> {
     }
 
     fn virtual_register(&self, node: NodeId) -> VirtualRegister {
-        node.index() * self.vectors + if self.op(node).is_shared() { 0 } else { self.now.1 }
+        VirtualRegister { node, k: if self.op(node).is_shared() { 0 } else { self.now.1 } }
+    }
+
+    /// Its place in tables of all virtual registers.
+    fn index(&self, VirtualRegister { node, k }: VirtualRegister) -> usize {
+        node.index() * self.vectors + k
     }
 
     fn op(&self, node: NodeId) -> MachineOp {
@@ -181,16 +241,24 @@ impl<'a> RegisterAllocator<'a> {
     }
 
     /// Position of the next use of a virtual register after the current instruction; larger is later.
-    fn next_use(&self, virtual_register: VirtualRegister) -> Option<usize> {
-        let (node, k) = (NodeId((virtual_register / self.vectors) as u32), virtual_register % self.vectors);
+    fn next_use(&self, VirtualRegister { node, k }: VirtualRegister) -> Option<usize> {
         let (at, now) = self.now;
-        let uses = self.uses.get(&node)?;
-        if self.op(node).is_shared() {
-            let first = uses.partition_point(|place| *place < at || *place == at && now + 1 == self.vectors);
-            return uses.get(first).map(|place| place * self.vectors + if *place == at { now + 1 } else { 0 });
-        }
-        let first = uses.partition_point(|place| *place < at || *place == at && k <= now);
-        uses.get(first).map(|place| place * self.vectors + k)
+        let shared = self.op(node).is_shared();
+        let is_past =
+            |place: usize| place < at || place == at && if shared { now + 1 == self.vectors } else { k <= now };
+        let mut places = self.uses.of(node).iter().map(|place| *place as usize);
+        let place = places.find(|place| !is_past(*place));
+        let place = place.or((self.pinned == Some(node)).then_some(self.order.len() + 1))?;
+        Some(
+            place * self.vectors
+                + if !shared {
+                    k
+                } else if place == at {
+                    now + 1
+                } else {
+                    0
+                },
+        )
     }
 
     fn at_home(&self, home: Home, k: usize) -> Place {
@@ -198,15 +266,16 @@ impl<'a> RegisterAllocator<'a> {
     }
 
     /// A free spill slot.
-    fn free_spill_slot(&mut self) -> usize {
+    fn free_spill_slot(&mut self) -> u32 {
         self.free_spills.pop().unwrap_or_else(|| {
             self.spilled += 1;
-            self.spilled - 1
+            self.spilled as u32 - 1
         })
     }
 
-    fn spill_operand(&self, number: usize) -> Place {
-        Place::Memory(Base::Block, (self.spills_at + number * self.width.bytes() as usize) as i32)
+    fn spill_operand(&self, number: u32) -> Place {
+        let (base, begin) = self.spills_at;
+        Place::Memory(base, (begin + number as usize * self.width.bytes() as usize) as i32)
     }
 
     /// A register or memory operand for a node. A value in memory that is read again is loaded first, if a register is
@@ -214,9 +283,8 @@ impl<'a> RegisterAllocator<'a> {
     fn operand(&mut self, node: NodeId) -> Place {
         let virtual_register = self.virtual_register(node);
         let mask = self.is_mask(node);
-        if let Some(register) = self.register.get(&virtual_register) {
-            let register = *register;
-            self.locked.push((mask, register));
+        if let Some(register) = self.register[self.index(virtual_register)] {
+            self.lock(mask, register);
             return Place::Register(register);
         }
         let place = self.memory_operand(node);
@@ -224,6 +292,17 @@ impl<'a> RegisterAllocator<'a> {
             return place;
         }
         Place::Register(self.load_into_register(node, place))
+    }
+
+    /// As [`operand`](Self::operand), for an instruction that has no scalar form: a single lane must be in a register, since
+    /// the instruction would read the memory of a pair.
+    fn operand_of(&mut self, instruction: Instruction, node: NodeId) -> Place {
+        match self.operand(node) {
+            place @ Place::Memory(..) if self.width == Vectors::Scalar && instruction.scalar().is_none() => {
+                Place::Register(self.load_into_register(node, place))
+            }
+            place => place,
+        }
     }
 
     /// Loads a node from memory into a register.
@@ -238,18 +317,19 @@ impl<'a> RegisterAllocator<'a> {
 
     /// Whether a vector register is free, or holds a value that is in memory too and has a later next use than `next`.
     fn is_room_until(&self, next: usize) -> bool {
-        (0..self.vector_of.len()).any(|register| {
-            let later = |virtual_register: VirtualRegister| {
-                self.is_in_memory(virtual_register) && self.next_use(virtual_register).is_none_or(|other| other > next)
-            };
-            !self.locked.contains(&(false, register as u8)) && self.vector_of[register].is_none_or(later)
-        })
+        let later = |held: Held| held.is_in_memory && held.next_use.is_none_or(|other| other > next);
+        self.vector_of
+            .iter()
+            .enumerate()
+            .any(|(register, held)| !self.is_locked(false, register) && held.is_none_or(later))
     }
 
     /// Whether a virtual register can be read from memory.
     fn is_in_memory(&self, virtual_register: VirtualRegister) -> bool {
-        let node = NodeId((virtual_register / self.vectors) as u32);
-        self.op(node).is_shared() || self.homes.contains_key(&node) || self.spills.contains_key(&virtual_register)
+        let node = virtual_register.node;
+        self.op(node).is_shared()
+            || self.homes[node.index()].is_some()
+            || self.spills[self.index(virtual_register)].is_some()
     }
 
     fn memory_operand(&mut self, node: NodeId) -> Place {
@@ -258,11 +338,11 @@ impl<'a> RegisterAllocator<'a> {
             MachineOp::TableRow(table, second) => return self.code.row(table.row(second)),
             _ => {}
         }
-        if let Some(number) = self.spills.get(&self.virtual_register(node)) {
-            return self.spill_operand(*number);
+        if let Some(number) = self.spills[self.index(self.virtual_register(node))] {
+            return self.spill_operand(number);
         }
-        let home = self.homes.get(&node).unwrap_or_else(|| panic!("{:?} lies nowhere", self.op(node)));
-        self.at_home(*home, self.now.1)
+        let home = self.homes[node.index()].unwrap_or_else(|| panic!("{:?} lies nowhere", self.op(node)));
+        self.at_home(home, self.now.1)
     }
 
     /// The register of a node, which is loaded if necessary.
@@ -295,9 +375,10 @@ impl<'a> RegisterAllocator<'a> {
     }
 
     fn assign(&mut self, virtual_register: VirtualRegister, mask: bool, register: u8) {
-        self.register.insert(virtual_register, register);
-        let table = if mask { &mut self.mask_of } else { &mut self.vector_of };
-        table[register as usize] = Some(virtual_register);
+        let index = self.index(virtual_register);
+        self.register[index] = Some(register);
+        let (next_use, is_in_memory) = (self.next_use(virtual_register), self.is_in_memory(virtual_register));
+        self.held_in(mask)[register as usize] = Some(Held { virtual_register, next_use, is_in_memory });
     }
 
     /// A register without a value, after an eviction if necessary. It is locked to the end of the current instruction.
@@ -305,37 +386,34 @@ impl<'a> RegisterAllocator<'a> {
         let table = if mask { &self.mask_of } else { &self.vector_of };
         // Mask register 0 encodes "no mask".
         let first = usize::from(mask);
-        let locked = |register: usize| self.locked.contains(&(mask, register as u8));
-        let free = (first..table.len()).find(|register| table[*register].is_none() && !locked(*register));
+        let unlocked = || (first..table.len()).filter(|register| !self.is_locked(mask, *register));
+        let free = unlocked().find(|register| table[*register].is_none());
         let register = free.unwrap_or_else(|| {
-            let candidates = (first..table.len()).filter(|register| !locked(*register));
             // Evicting a value that is in memory needs no store, so the distance to its next use counts double.
-            let last = candidates.max_by_key(|register| {
-                let virtual_register = table[*register].expect("none is free");
-                let wait = |next: usize| {
-                    (next - self.now.0 * self.vectors) * if self.is_in_memory(virtual_register) { 2 } else { 1 }
-                };
-                self.next_use(virtual_register).map_or(usize::MAX, wait)
+            let last = unlocked().max_by_key(|register| {
+                let held = table[*register].expect("none is free");
+                let wait = |next: usize| (next - self.now.0 * self.vectors) * if held.is_in_memory { 2 } else { 1 };
+                held.next_use.map_or(usize::MAX, wait)
             });
             last.expect("an instruction locks fewer registers than there are")
         });
         if free.is_none() {
             self.spill(mask, register as u8);
         }
-        self.locked.push((mask, register as u8));
+        self.lock(mask, register as u8);
         register as u8
     }
 
     /// Evicts a register; its value is stored if it is read later and not in memory.
     fn spill(&mut self, mask: bool, register: u8) {
-        let table = if mask { &mut self.mask_of } else { &mut self.vector_of };
-        let virtual_register = table[register as usize].take().expect("a value is in it");
-        self.register.remove(&virtual_register);
-        let node = NodeId((virtual_register / self.vectors) as u32);
-        if self.next_use(virtual_register).is_some() && !self.is_in_memory(virtual_register) {
+        let held = self.held_in(mask)[register as usize].take();
+        let Held { virtual_register, next_use, is_in_memory } = held.expect("a value is in it");
+        let index = self.index(virtual_register);
+        self.register[index] = None;
+        if next_use.is_some() && !is_in_memory {
             let number = self.free_spill_slot();
-            self.spills.insert(virtual_register, number);
-            self.store(node, register, self.spill_operand(number));
+            self.spills[index] = Some(number);
+            self.store(virtual_register.node, register, self.spill_operand(number));
         }
     }
 
@@ -345,13 +423,13 @@ impl<'a> RegisterAllocator<'a> {
         if self.next_use(virtual_register).is_some() {
             return;
         }
-        if let Some(register) = self.register.remove(&virtual_register) {
+        let index = self.index(virtual_register);
+        if let Some(register) = self.register[index].take() {
             let mask = self.is_mask(node);
-            let table = if mask { &mut self.mask_of } else { &mut self.vector_of };
-            table[register as usize] = None;
-            self.locked.retain(|locked| *locked != (mask, register));
+            self.held_in(mask)[register as usize] = None;
+            self.locked[usize::from(mask)] &= !(1 << register);
         }
-        if let Some(number) = self.spills.remove(&virtual_register) {
+        if let Some(number) = self.spills[index].take() {
             // The current instruction may still read the slot.
             self.freed_by_instruction.push(number);
         }
@@ -359,7 +437,7 @@ impl<'a> RegisterAllocator<'a> {
 
     /// Ends the current instruction.
     fn end_instruction(&mut self, node: NodeId) {
-        self.locked.clear();
+        self.locked = [0; 2];
         self.release(node);
         self.free_spills.append(&mut self.freed_by_instruction);
     }
@@ -379,28 +457,59 @@ impl<'a> RegisterAllocator<'a> {
         register
     }
 
-    /// Locks the registers of operands, so that loading another operand does not evict them.
-    fn lock(&mut self, operands: impl Iterator<Item = NodeId>) {
+    /// Begins an instruction that reads these operands: locks their registers, so that loading another operand does not
+    /// evict them.
+    fn begin_instruction(&mut self, operands: impl Iterator<Item = NodeId>) {
         for operand in operands {
-            if let Some(register) = self.register.get(&self.virtual_register(operand)) {
-                self.locked.push((self.is_mask(operand), *register));
+            let virtual_register = self.virtual_register(operand);
+            if let Some(register) = self.register[self.index(virtual_register)] {
+                let (mask, next_use) = (self.is_mask(operand), self.next_use(virtual_register));
+                self.lock(mask, register);
+                let held = self.held_in(mask)[register as usize].as_mut();
+                held.expect("the operand is in it").next_use = next_use;
             }
         }
     }
 
+    fn lock(&mut self, mask: bool, register: u8) {
+        self.locked[usize::from(mask)] |= 1 << register;
+    }
+
+    fn is_locked(&self, mask: bool, register: usize) -> bool {
+        self.locked[usize::from(mask)] & 1 << register != 0
+    }
+
+    /// What the registers hold: those for vectors or those for masks.
+    fn held_in(&mut self, mask: bool) -> &mut [Option<Held>] {
+        if mask { &mut self.mask_of } else { &mut self.vector_of }
+    }
+
     fn node(&mut self, node: NodeId) {
         let op = self.op(node);
-        let virtual_register = self.virtual_register(node);
-        if self.register.contains_key(&virtual_register) || self.spills.contains_key(&virtual_register) {
+        self.begin_instruction(op.operands());
+        let index = self.index(self.virtual_register(node));
+        if self.register[index].is_some() || self.spills[index].is_some() {
             // Already computed, together with an earlier node.
             return op.operands().for_each(|operand| self.release(operand));
         }
-        self.lock(op.operands());
         match op {
             MachineOp::Load(_) | MachineOp::Constant(_) | MachineOp::TableRow(..) => unreachable!("they lie in memory"),
+            MachineOp::Binary(i::VPMULLQ, _, a, b) if self.width == Vectors::Scalar => {
+                let [a, b] = [a, b].map(|operand| self.in_register(operand));
+                let to = self.result(node);
+                self.code.integer_product(to, a, b);
+            }
+            MachineOp::Unary(instruction @ (i::VCVTTPD2QQ | i::VCVTQQ2PD), _, a) if self.width == Vectors::Scalar => {
+                let from = self.in_register(a);
+                let to = self.result(node);
+                match instruction {
+                    i::VCVTTPD2QQ => self.code.integer_of(to, from),
+                    _ => self.code.real_of(to, from),
+                }
+            }
             MachineOp::Binary(instruction, exchange, a, b) => self.two(node, instruction, exchange, a, b),
             MachineOp::Unary(instruction, immediate, a) => {
-                let last = self.operand(a);
+                let last = self.operand_of(instruction, a);
                 let to = self.result(node);
                 self.code.vector(instruction, to, 0, last, immediate);
             }
@@ -435,7 +544,7 @@ impl<'a> RegisterAllocator<'a> {
                 // There is no instruction for less: a < b is b > a.
                 let instruction = if predicate == 0 { i::VPCMPEQQ } else { i::VPCMPGTQ };
                 let first = self.in_register(b);
-                let last = self.operand(a);
+                let last = self.operand_of(instruction, a);
                 let to = self.result(node);
                 self.code.vector(instruction, to, first, last, None);
             }
@@ -474,11 +583,11 @@ impl<'a> RegisterAllocator<'a> {
             MachineOp::Select(when, a, b) => {
                 let mask = self.in_register(when);
                 let other = self.in_register(b);
-                let chosen = self.operand(a);
+                let chosen = self.operand_of(i::VBLENDVPD, a);
                 let to = self.result(node);
                 match self.width {
                     Vectors::Avx512 => self.code.masked(i::VBLENDMPD, to, other, chosen, None, mask),
-                    Vectors::Avx | Vectors::Avx2 => self.code.vector(i::VBLENDVPD, to, other, chosen, Some(mask << 4)),
+                    _ => self.code.vector(i::VBLENDVPD, to, other, chosen, Some(mask << 4)),
                 }
             }
             MachineOp::Permute(first, second, index) => {
@@ -499,6 +608,15 @@ impl<'a> RegisterAllocator<'a> {
                 self.code.gather(to, from, mask, 8 * base as i32);
                 self.release(index);
             }
+            MachineOp::Gather { base, index, .. } if self.width == Vectors::Scalar => {
+                self.look_up_one(node, index, (Base::Pool, 8 * base as i32));
+            }
+            MachineOp::Ring(base, index) => self.look_up_one(node, index, (Base::Block, 8 * base.0 as i32)),
+            MachineOp::Write(base, index, value) => {
+                let [index, value] = [index, value].map(|operand| self.in_register(operand));
+                self.code.write_one(value, index, (Base::Block, 8 * base.0 as i32));
+                op.operands().for_each(|operand| self.release(operand));
+            }
             MachineOp::Gather { index, .. } => {
                 // Up to four tables that are read at the same index are looked up together.
                 let same =
@@ -508,6 +626,13 @@ impl<'a> RegisterAllocator<'a> {
                 self.release(index);
             }
         }
+    }
+
+    /// Loads the entry of a table at an index, for a single lane.
+    fn look_up_one(&mut self, node: NodeId, index: NodeId, table: (Base, i32)) {
+        let from = self.in_register(index);
+        let to = self.result(node);
+        self.code.look_up_one(to, from, table);
     }
 
     /// Loads entries of tables at the same index. Two tables of elementary functions, whose contents are known here,
@@ -552,7 +677,7 @@ impl<'a> RegisterAllocator<'a> {
     }
 
     fn two(&mut self, node: NodeId, instruction: Instruction, exchange: bool, a: NodeId, b: NodeId) {
-        let (first, last) = match (self.operand(a), self.operand(b)) {
+        let (first, last) = match (self.operand_of(instruction, a), self.operand_of(instruction, b)) {
             (Place::Register(a), last) => (a, last),
             (last, Place::Register(b)) if exchange => (b, last),
             _ if a == b => {

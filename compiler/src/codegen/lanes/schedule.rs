@@ -11,23 +11,28 @@ use abi::Slot;
 
 /// Orders those of the `wanted` nodes that `roots` need, loads and constants excepted. The nodes of each root are
 /// adjacent, operands first. Of several operands the one that needs most registers comes first.
-fn schedule(nodes: &Nodes, roots: &[NodeId], wanted: &[bool]) -> Vec<NodeId> {
+pub fn schedule(nodes: &Nodes, roots: &[NodeId], wanted: &[bool]) -> Vec<NodeId> {
     let is_read = |node: NodeId| !wanted[node.index()] || nodes.nodes[node.index()].is_leaf();
     // Sethi–Ullman number: registers that computing a node takes, if no value is shared.
     let mut need = vec![0; nodes.nodes.len()];
     for (index, node) in nodes.nodes.iter().enumerate() {
         // A node that is not wanted is in memory, as a leaf is, and takes none.
-        let mut of: Vec<usize> = node.operands().map(|operand| need[operand.index()]).collect();
-        of.sort_unstable_by(|a, b| b.cmp(a));
-        let most = of.iter().enumerate().map(|(before, need)| need + before).max();
+        let most = by_need(*node, &need).enumerate().map(|(before, operand)| need[operand.index()] + before).max();
         need[index] = if is_read(NodeId(index as u32)) { 0 } else { most.unwrap_or(0).max(1) };
     }
-    let operands = |node: NodeId| {
-        let mut operands: Vec<NodeId> = nodes.nodes[node.index()].operands().collect();
-        operands.sort_by_key(|operand| std::cmp::Reverse(need[operand.index()]));
-        operands
-    };
+    let operands = |node: NodeId| by_need(nodes.nodes[node.index()], &need);
     topological_order(roots, nodes.nodes.len(), NodeId::index, is_read, operands)
+}
+
+/// The operands of a node, those that need most registers first.
+fn by_need(node: MachineOp, need: &[usize]) -> impl DoubleEndedIterator<Item = NodeId> {
+    let (mut operands, mut count) = ([NodeId(0); 3], 0);
+    for operand in node.operands() {
+        operands[count] = operand;
+        count += 1;
+    }
+    operands[..count].sort_by_key(|operand| std::cmp::Reverse(need[operand.index()]));
+    operands.into_iter().take(count)
 }
 
 impl StraightLine for Nodes {
