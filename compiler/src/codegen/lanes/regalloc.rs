@@ -205,7 +205,8 @@ impl<'a> RegisterAllocator<'a> {
                     let more = self.in_register(mask);
                     self.code.mask(i::KORB, all, all, Place::Register(more));
                 }
-                Vectors::Scalar | Vectors::Avx | Vectors::Avx2 => {
+                Vectors::Scalar => unreachable!("a single lane is one vector"),
+                Vectors::Avx | Vectors::Avx2 => {
                     let more = self.operand(mask);
                     self.code.vector(i::VORPD, all, all, more, None);
                 }
@@ -214,7 +215,8 @@ impl<'a> RegisterAllocator<'a> {
         }
         match self.width {
             Vectors::Avx512 => self.code.mask(i::KORTESTB, all, 0, Place::Register(all)),
-            Vectors::Scalar | Vectors::Avx | Vectors::Avx2 => {
+            Vectors::Scalar => unreachable!("baseline code has no loop"),
+            Vectors::Avx | Vectors::Avx2 => {
                 let l = u8::from(self.width == Vectors::Avx2);
                 self.code.raw(&[0xc4, 0x41 | (!all >> 3 & 1) << 5, 0x79 | l << 2, 0x50, 0xd0 | all & 7]);
                 self.code.raw(&[0x45, 0x85, 0xd2]); // test r10d, r10d
@@ -243,22 +245,17 @@ impl<'a> RegisterAllocator<'a> {
     /// Position of the next use of a virtual register after the current instruction; larger is later.
     fn next_use(&self, VirtualRegister { node, k }: VirtualRegister) -> Option<usize> {
         let (at, now) = self.now;
-        let shared = self.op(node).is_shared();
-        let is_past =
-            |place: usize| place < at || place == at && if shared { now + 1 == self.vectors } else { k <= now };
+        // Which vector reads it at a place: its own, or the next one if all share it. Beyond the last one: none.
+        let reader = |place: usize| match self.op(node).is_shared() {
+            false => k,
+            true if place == at => now + 1,
+            true => 0,
+        };
+        let is_to_come = |place: usize| place > at || place == at && (now + 1..self.vectors).contains(&reader(place));
         let mut places = self.uses.of(node).iter().map(|place| *place as usize);
-        let place = places.find(|place| !is_past(*place));
-        let place = place.or((self.pinned == Some(node)).then_some(self.order.len() + 1))?;
-        Some(
-            place * self.vectors
-                + if !shared {
-                    k
-                } else if place == at {
-                    now + 1
-                } else {
-                    0
-                },
-        )
+        let pinned = (self.pinned == Some(node)).then_some(self.order.len() + 1);
+        let place = places.find(|place| is_to_come(*place)).or(pinned)?;
+        Some(place * self.vectors + reader(place))
     }
 
     fn at_home(&self, home: Home, k: usize) -> Place {
@@ -318,10 +315,9 @@ impl<'a> RegisterAllocator<'a> {
     /// Whether a vector register is free, or holds a value that is in memory too and has a later next use than `next`.
     fn is_room_until(&self, next: usize) -> bool {
         let later = |held: Held| held.is_in_memory && held.next_use.is_none_or(|other| other > next);
-        self.vector_of
-            .iter()
-            .enumerate()
-            .any(|(register, held)| !self.is_locked(false, register) && held.is_none_or(later))
+        let fits =
+            |(register, held): (usize, &Option<Held>)| !self.is_locked(false, register) && held.is_none_or(later);
+        self.vector_of.iter().enumerate().any(fits)
     }
 
     /// Whether a virtual register can be read from memory.
