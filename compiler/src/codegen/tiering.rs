@@ -223,10 +223,10 @@ impl Policy {
         Policy { baseline_after: never, compiled_after: never, runs_between_looks: 64, in_background: false }
     };
 
-    /// Compiles when the runs so far have lost about as much as compiling takes. Interpreting an operation takes 2 to 4 ns. Baseline
-    /// code takes a tenth of that, and its compilation 0.3 µs for an operation; adaptive steps are hardly ever so few that
-    /// interpreting them would pay. Cranelift takes 7 µs for an operation and saves 0.2 ns of each run, in an adaptive step 10 µs
-    /// and 0.02 ns. Where there is no baseline code, it saves nearly all that interpreting costs.
+    /// Compiles when the runs so far have lost about as much as compiling takes. Interpreting an operation takes 2 to 4
+    /// ns. Baseline code takes a tenth of that, and its compilation 0.3 µs for an operation; adaptive steps are hardly
+    /// ever so few that interpreting them would pay. Cranelift takes 7 µs for an operation and saves 0.2 ns of each run;
+    /// in an adaptive step 10 µs, and 0.02 ns. Where there is no baseline code, it saves nearly all that interpreting costs.
     pub fn usual() -> Policy {
         let (others, rosenbrock) = if Baseline::is_here() { (16_000, 250_000) } else { (800, 4_000) };
         let mut compiled_after = [Some(others); Function::ALL.len()];

@@ -1,8 +1,9 @@
 //! Baseline code: a function for a single instance, by the code generator of lanes.
 //!
-//! It is made in a thirtieth of the time that Cranelift needs, because nothing is searched for: one pass selects instructions, one
-//! orders them, one allocates registers and emits. An adaptive step takes 1.1 times as long as optimised code, a fixed step,
-//! of which nothing is hoisted, 1.3 to 1.9 times. So runs that end before Cranelift is done run in machine code too.
+//! It is made in a thirtieth of the time that Cranelift needs, because nothing is searched for: one pass selects
+//! instructions, one orders them, one allocates registers and emits. An adaptive step takes 1.1 times as long as optimised
+//! code, a fixed step, of which nothing is hoisted, 1.3 to 1.9 times. So runs that end before Cranelift is done run in
+//! machine code too.
 //!
 //! In: a function, expanded or not. Out: code with the bits of [`ir::interpret`](crate::ir::interpret).
 //!
