@@ -335,7 +335,7 @@ impl Functions {
 }
 
 /// A step that records is compiled first. It pays to compile the step as such too after so many times as many runs.
-const BESIDE_RECORDING: u64 = 16;
+const BESIDE_RECORDING: u64 = 2;
 
 impl Tiered {
     /// Compiles a function if that pays by now and nobody has begun to.
