@@ -221,6 +221,11 @@ pub fn largest_stable(program: &Program, ends: &[Slot], method: Method) -> Optio
     Some(Bench::new(program, ends)?.largest_stable(method))
 }
 
+/// The step of a method with all ticks and transitions.
+fn repeated_step(program: &Program, method: Method) -> Repeated {
+    Repeated::new(expand(&fixed_step::step(program, method)))
+}
+
 /// A value at which an open input is held while others vary: 0 if that is in its range.
 fn resting((low, high): (f64, f64)) -> f64 {
     if (low..=high).contains(&0.0) {
@@ -722,7 +727,7 @@ impl<'a> Bench<'a> {
 
     /// The step of a method with all ticks and transitions, expanded, for a program without delays.
     fn step(&self, method: Method) -> Rc<Repeated> {
-        let make = || Rc::new(Repeated::new(expand(&fixed_step::step(self.program, method))));
+        let make = || Rc::new(repeated_step(self.program, method));
         self.steps.borrow_mut().entry(method as u8).or_insert_with(make).clone()
     }
 
@@ -757,10 +762,7 @@ impl<'a> Bench<'a> {
         at[Slot::STEP.index()] = h;
         let (start, step) = match program {
             Cow::Borrowed(_) => (Cow::Borrowed(&self.code.start), self.step(method)),
-            Cow::Owned(_) => (
-                Cow::Owned(expand(&program.start)),
-                Rc::new(Repeated::new(expand(&fixed_step::step(&program, method)))),
-            ),
+            Cow::Owned(_) => (Cow::Owned(expand(&program.start)), Rc::new(repeated_step(&program, method))),
         };
         run_once(&start, &mut at, &program.description.pool);
         at[layout.states.range()].copy_from_slice(&block[self.program.description.layout.states.range()]);

@@ -177,7 +177,7 @@ pub fn late(program: &Program, method: Method, interpret: bool) -> (Code, Vec<St
     if size <= MAX_TIERED_OPS && target::here().is_ok() {
         return (on_demand(program, method, false), Vec::new());
     }
-    // A program that may be too large for machine code is compiled at once, so that the note about it comes at once.
+    // A program that may be too large for Cranelift is compiled at once, so that the note about it comes at once.
     code(&functions(program, method), &program.description, false)
 }
 
@@ -205,12 +205,11 @@ pub type Thresholds = [Option<u64>; Function::ALL.len()];
 /// When the functions of tiered code are compiled. The bits of a run do not depend on it.
 #[derive(Clone, Debug)]
 pub struct Policy {
-    /// How often functions are interpreted before they have baseline code.
+    /// Numbers of interpreted runs after which functions get baseline code.
     pub baseline_after: Thresholds,
-    /// How often they run before they are compiled by Cranelift.
+    /// Numbers of runs, interpreted or in baseline code, after which Cranelift compiles them.
     pub compiled_after: Thresholds,
-    /// Runs within one call of the interpreter, at least 1, before it looks again whether to group or to compile and
-    /// whether there is code.
+    /// Runs, at least 1, after which a call looks again whether compiling pays by now and whether there is code.
     pub runs_between_looks: u64,
     /// Whether a thread of its own compiles, while the run continues; otherwise the next call waits for it.
     pub in_background: bool,
@@ -301,8 +300,8 @@ impl Functions {
         back_end(std::slice::from_ref(func), &self.program.description.layout, self.program.description.pool.len())
     }
 
-    /// Interprets a function up to `count` times.
-    fn interpret(&self, which: Function, block: &mut [f64], pool: &[f64], count: u64) -> u64 {
+    /// Runs a function up to `count` times, interpreted or in baseline code.
+    fn run(&self, which: Function, block: &mut [f64], pool: &[f64], count: u64) -> u64 {
         let Forms { interpreter, baseline, runs, .. } = &self.forms[which as usize];
         let after = self.policy.baseline_after[which as usize];
         if after.is_some_and(|after| runs.load(Ordering::Relaxed) >= after) {
@@ -375,7 +374,7 @@ impl Interpret for Tiered {
             }
             let runs = left.min(self.0.policy.runs_between_looks);
             let before = settled(block);
-            let status = self.0.interpret(which, block, pool, runs);
+            let status = self.0.run(which, block, pool, runs);
             // A call for adaptive steps ends at the first step that it leaves open, most often long before `count`.
             let done = if which == Function::Rosenbrock { 1 + settled(block).saturating_sub(before) } else { runs };
             forms.runs.fetch_add(done, Ordering::Relaxed);

@@ -85,8 +85,8 @@ pub enum Place {
 pub struct Instruction(pub u8, pub u8, pub [u8; 2], pub u8);
 
 impl Instruction {
-    /// The same for a single double, which it reads from memory where the instruction reads a vector. None for
-    /// operations on bits and on integers.
+    /// The scalar form of a packed instruction: it computes one double, and reads 8 bytes of memory where the packed form
+    /// reads a vector. `None` for operations on bits and on integers, which have no scalar form.
     pub fn scalar(self) -> Option<Instruction> {
         let Instruction(prefix, map, w, opcode) = self;
         match (prefix, map, opcode) {
@@ -145,15 +145,16 @@ pub mod instructions {
     pub const VUNPCKHPD: Instruction = Instruction(1, 1, [1, 0], 0x15);
     /// A single double from memory, into the low lane.
     pub const VMOVSD: Instruction = Instruction(3, 1, [0, 0], 0x10);
+    pub const VMOVHPD: Instruction = Instruction(1, 1, [0, 0], 0x16);
+    /// The low lane to memory.
     pub const VMOVSD_STORE: Instruction = Instruction(3, 1, [0, 0], 0x11);
-    /// Between a lane (reg) and a general register (rm). VEX only, as the conversions that follow.
+    /// Copies between the low lane of reg and the general register rm. VEX only, as the conversions that follow.
     pub const VMOVQ_FROM_GENERAL: Instruction = Instruction(1, 1, [1, 1], 0x6e);
     pub const VMOVQ_TO_GENERAL: Instruction = Instruction(1, 1, [1, 1], 0x7e);
-    /// From rm, a general register; v gives the upper lane.
+    /// Converts the integer in the general register rm to a double; the upper lane is copied from v.
     pub const VCVTSI2SD: Instruction = Instruction(3, 1, [1, 1], 0x2a);
-    /// To reg, a general register.
+    /// Converts a double, without its fraction, to an integer in the general register reg.
     pub const VCVTTSD2SI: Instruction = Instruction(3, 1, [1, 1], 0x2c);
-    pub const VMOVHPD: Instruction = Instruction(1, 1, [0, 0], 0x16);
     pub const VPCMPEQQ: Instruction = Instruction(1, 2, [1, 0], 0x29);
     pub const VPCMPGTQ: Instruction = Instruction(1, 2, [1, 0], 0x37);
     pub const VBLENDVPD: Instruction = Instruction(1, 3, [0, 0], 0x4b);
@@ -268,6 +269,12 @@ impl Assembler {
         };
         self.vex(form.unwrap_or(instruction), reg, second, last, 0);
         self.operand(reg, last, immediate, 1);
+    }
+
+    /// Copies a vector from memory to memory, through register 0.
+    pub fn copy(&mut self, from: Place, to: Place) {
+        self.vector(instructions::VMOVAPD_LOAD, 0, 0, from, None);
+        self.vector(instructions::VMOVAPD_STORE, 0, 0, to, None);
     }
 
     /// Emits an instruction on mask registers.
@@ -530,7 +537,7 @@ impl Assembler {
         // EVEX broadcasts one double from memory; VEX needs a full vector.
         let copies = match self.width {
             Vectors::Avx512 => 1,
-            // Operations on bits and on integers are those of pairs.
+            // Operations on bits and on integers have no scalar form, so they read two doubles.
             Vectors::Scalar => 2,
             width => width.lanes(),
         };

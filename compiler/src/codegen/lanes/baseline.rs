@@ -1,9 +1,9 @@
 //! Baseline code: a function for a single instance, by the code generator of lanes.
 //!
-//! It is made in a thirtieth of the time that Cranelift needs, because nothing is searched for: one pass selects
+//! It is made in a thirtieth of the time that Cranelift takes, because there are no optimisations: one pass selects
 //! instructions, one orders them, one allocates registers and emits. An adaptive step takes 1.1 times as long as optimised
-//! code, a fixed step, of which nothing is hoisted, 1.3 to 1.9 times. So runs that end before Cranelift is done run in
-//! machine code too.
+//! code; a fixed step takes 1.3 to 1.9 times as long, since no invariants are hoisted. So runs that end before Cranelift
+//! is done have machine code too.
 //!
 //! In: a function, expanded or not. Out: code with the bits of [`ir::interpret`](crate::ir::interpret).
 //!
@@ -13,17 +13,16 @@
 //!
 //! Source of the idea: Arnold, Fink, Grove, Hind, Sweeney, *Adaptive Optimization in the Jalapeño JVM*, OOPSLA, 2000.
 
-use super::assembler::{Assembler, Base, Vectors, instructions};
+use super::assembler::{Assembler, Base, Vectors};
 use super::isel::{MachineOp, NodeId, select};
 use super::regalloc::{Home, RegisterAllocator, place_in};
-use super::{by_node, schedule};
+use super::{by_node, expanded, schedule};
 use crate::codegen::executable_memory::Executable;
 use crate::codegen::target::here;
 use crate::codegen::unsupported::Unsupported;
 use crate::ir::Func;
 use crate::ir::hash::HashSet;
 use crate::ir::interpret::{run_once, until_status};
-use crate::ir::verify::{Stage, verify};
 use crate::math;
 use abi::lanes::BaselineEntry;
 use abi::table::{Code, Interpret};
@@ -36,8 +35,8 @@ thread_local! {
     static SCRATCH: Cell<Vec<u64>> = const { Cell::new(Vec::new()) };
 }
 
-/// Number of runs that take as long to interpret, 2 to 4 ns for an operation, as compiling takes: 0.3 µs for an operation,
-/// and 10 µs in all.
+/// Number of runs after which baseline code pays: interpreting takes 2 to 4 ns for an operation, and compiling 0.3 µs for an
+/// operation and 10 µs for the function.
 pub const PAYS_AFTER: u64 = 128;
 
 /// A function as machine code for one instance.
@@ -62,11 +61,12 @@ impl Baseline {
         if !Baseline::is_here() {
             return Err(Unsupported("this processor lacks AVX and FMA".into()));
         }
-        let elementary = func.has_elementary_functions();
-        let expanded = elementary.then(|| math::expand(func));
-        let func = expanded.as_ref().unwrap_or(func);
-        verify(func, layout, pool_len, Stage::Lowered).unwrap_or_else(|fault| panic!("{fault}"));
-        let (code, scratch) = generate(func, elementary)?;
+        let (func, pooled) = expanded(func, layout, pool_len, math::expand);
+        let (code, scratch) = generate(&func, pooled)?;
+        // Code adds displacements of 32 bits to the block, the pool and the scratch space.
+        if 8 * layout.size().max(pool_len).max(scratch) > i32::MAX as usize {
+            return Err(Unsupported(format!("`{}` needs a block that is too large", func.name)));
+        }
         let memory = Executable::new(&code, 64)?;
         // SAFETY: the address is the start of code with this signature.
         let entry = unsafe { std::mem::transmute::<*const u8, BaselineEntry>(memory.address()) };
@@ -168,11 +168,8 @@ fn generate(func: &Func, pooled: bool) -> Result<(Vec<u8>, usize), Unsupported> 
         // A result may be stored before its slot is loaded for the last time.
         if stored.contains(slot) {
             let kept = Home { base: Base::Scratch, begin: 0, index: scratch };
-            for (instruction, Home { base, index, .. }) in
-                [(instructions::VMOVAPD_LOAD, in_block), (instructions::VMOVAPD_STORE, kept)]
-            {
-                code.vector(instruction, 0, 0, place_in(base, 0, index, 1, 0, Vectors::Scalar), None);
-            }
+            let place = |home: Home| place_in(home.base, home.begin, home.index, 1, 0, Vectors::Scalar);
+            code.copy(place(in_block), place(kept));
             homes[index] = Some(kept);
             scratch += 1;
         }

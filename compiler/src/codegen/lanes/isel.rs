@@ -369,7 +369,7 @@ impl Selection {
     fn node(&mut self, func: &Func, op: Op, of_type: Type, of: &[NodeId]) -> Result<NodeId, Unsupported> {
         let at = |value: Value| of[value.index()];
         let has_masks = self.width == Vectors::Avx512;
-        // Products of integers and conversions; a single lane has them in general registers.
+        // AVX and AVX2 neither multiply 64-bit integers nor convert them. Code for a single lane does so in general registers.
         let has_integers = has_masks || self.width == Vectors::Scalar;
         if let Some(x) = sign_of(op, |value| func.op(value)) {
             return Ok(self.sign(at(x)));

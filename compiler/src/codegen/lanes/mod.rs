@@ -7,7 +7,7 @@
 //! needs, such as outputs, are computed in the last step only. Carried slots alternate between two areas, so that a
 //! step in which a lane fails can be repeated in full, with statuses.
 //!
-//! [`baseline`] is the same for a single instance and one step.
+//! [`baseline`] generates scalar code for a single instance by the same passes, without a loop.
 //!
 //! A loop over [rows](with_rows) also reads inputs from a row and writes outputs to one in each step.
 //!
@@ -28,7 +28,7 @@ pub mod baseline;
 use super::target::{FunctionCompiler, here, most_lanes};
 use super::unsupported::Unsupported;
 use crate::codegen::executable_memory::Executable;
-use crate::codegen::lanes::assembler::{Assembler, Base, Vectors, instructions};
+use crate::codegen::lanes::assembler::{Assembler, Base, Vectors};
 use crate::codegen::lanes::isel::{MachineOp, NodeId, select};
 use crate::codegen::lanes::regalloc::{Home, RegisterAllocator, place_in};
 use crate::codegen::loop_plan::{LoopPlan, plan};
@@ -39,6 +39,7 @@ use crate::ir::{Func, Unary};
 use crate::math;
 use abi::lanes::{FollowLanes, FollowLanesEntry, Lanes, LanesEntry};
 use abi::{Layout, Slot};
+use std::borrow::Cow;
 use std::sync::Arc;
 
 /// Kind of vector.
@@ -233,19 +234,15 @@ pub fn bytes(
     vectors: usize,
     rows: Option<&Rows>,
 ) -> Result<Bytes, Unsupported> {
-    verify(func, layout, pool_len, Stage::Lowered).unwrap_or_else(|fault| panic!("{fault}"));
     let own: &[Unary] = match width {
         Width::Avx512 => &[Unary::Exp],
         Width::Avx2 | Width::Avx | Width::Pairs => &[],
     };
-    // Expanded functions read the tables with which the pool of every model begins. A step without elementary functions
-    // works with any pool.
-    let elementary = func.has_elementary_functions();
-    let expanded = elementary.then(|| math::expand_for_lanes(func, own));
-    let func = expanded.as_ref().unwrap_or(func);
+    let (func, pooled) = expanded(func, layout, pool_len, |func| math::expand_for_lanes(func, own));
+    let func = &*func;
     match width.vectors_of_x64() {
         Some(own) => {
-            let (code, scratch) = generate(func, layout, own, vectors, elementary, rows)?;
+            let (code, scratch) = generate(func, layout, own, vectors, pooled, rows)?;
             Ok(Bytes { code, alignment: 64, scratch })
         }
         None if rows.is_some() => Err(Unsupported("pairs have no loop over rows".into())),
@@ -254,6 +251,20 @@ pub fn bytes(
             Ok(Bytes { code: bytes.code, alignment: bytes.alignment as u64, scratch })
         }
     }
+}
+
+/// Expands the elementary functions of a function, and verifies the result. Also returns whether there are any: then the
+/// pool must begin with their tables, as that of every model does. A function without any works with any pool.
+fn expanded<'f>(
+    func: &'f Func,
+    layout: &Layout,
+    pool_len: usize,
+    expand: impl FnOnce(&Func) -> Func,
+) -> (Cow<'f, Func>, bool) {
+    let pooled = func.has_elementary_functions();
+    let func = if pooled { Cow::Owned(expand(func)) } else { Cow::Borrowed(func) };
+    verify(&func, layout, pool_len, Stage::Lowered).unwrap_or_else(|fault| panic!("{fault}"));
+    (func, pooled)
 }
 
 /// Generates the code; also returns the number of doubles it needs after the blocks. `pooled`: the pool begins with the
@@ -319,20 +330,8 @@ fn generate(
     }
     for (index, (slot, _)) in carried.iter().enumerate() {
         for k in 0..vectors {
-            code.vector(
-                instructions::VMOVAPD_LOAD,
-                0,
-                0,
-                place_in(Base::Block, 0, slot.index(), vectors, k, width),
-                None,
-            );
-            code.vector(
-                instructions::VMOVAPD_STORE,
-                0,
-                0,
-                place_in(Base::Block, areas[0], index, vectors, k, width),
-                None,
-            );
+            let place = |begin, index| place_in(Base::Block, begin, index, vectors, k, width);
+            code.copy(place(0, slot.index()), place(areas[0], index));
         }
     }
     for (area, opcode) in areas.into_iter().zip([0x87, 0x8f]) {
@@ -398,7 +397,7 @@ fn generate(
     Ok((code.finish(), scratch))
 }
 
-/// Where each node is stored.
+/// Groups stores by the node that is stored.
 fn by_node(stores: impl Iterator<Item = (NodeId, Home)>) -> HashMap<NodeId, Vec<Home>> {
     let mut of: HashMap<NodeId, Vec<Home>> = HashMap::default();
     stores.for_each(|(node, home)| of.entry(node).or_default().push(home));

@@ -34,11 +34,11 @@ struct VirtualRegister {
     k: usize,
 }
 
-/// Where the nodes of a line are read.
+/// Where the nodes of a straight line are read.
 struct Uses {
-    /// For each node which of the positions are its own and still to come.
+    /// For each node the range of `positions` with its reads that are still to come.
     rest: Vec<Range<u32>>,
-    /// Positions in the order.
+    /// The positions of all reads, node by node, for each node ascending.
     positions: Vec<u32>,
 }
 
@@ -69,7 +69,7 @@ impl Uses {
         &self.positions[start as usize..end as usize]
     }
 
-    /// Forgets that a position reads these nodes.
+    /// Drops the reads of these nodes at a position whose code has been emitted.
     fn pass(&mut self, at: usize, nodes: impl Iterator<Item = NodeId>) {
         for node in nodes {
             while self.of(node).first() == Some(&(at as u32)) {
@@ -79,7 +79,7 @@ impl Uses {
     }
 }
 
-/// What a register holds.
+/// What a register holds. An eviction compares all registers, so the next use is kept and not searched for each time.
 #[derive(Clone, Copy)]
 struct Held {
     virtual_register: VirtualRegister,
@@ -98,18 +98,19 @@ pub struct RegisterAllocator<'a> {
     uses: Uses,
     /// A node that is live to the end of the line.
     pinned: Option<NodeId>,
-    /// For each virtual register its register, if it has one.
+    /// The register that holds each virtual register, or none, by [`index`](Self::index).
     register: Vec<Option<u8>>,
-    /// For each virtual register its spill slot, if it has one.
+    /// The spill slot of each virtual register, or none, by the same.
     spills: Vec<Option<u32>>,
     free_spills: Vec<u32>,
     freed_by_instruction: Vec<u32>,
     spilled: usize,
-    /// Where the spill slots begin, in bytes.
+    /// The spill slots begin so many bytes after this base.
     spills_at: (Base, usize),
     vector_of: Vec<Option<Held>>,
     mask_of: Vec<Option<Held>>,
-    /// Registers that the current instruction needs, as bits: those for vectors and those for masks.
+    /// Registers that the current instruction reads or writes, which must not be evicted: a bit for each vector register,
+    /// and a bit for each mask register.
     locked: [u32; 2],
     /// The current position in the order, and the current vector.
     now: (usize, usize),
